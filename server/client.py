@@ -28,7 +28,7 @@ from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_pat
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
 from ..schemas.wire.request_limits import MAX_POSES
-from ..schemas.wire.requests import has_tolerance_or_budget, make_positions
+from ..schemas.wire.requests import make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
@@ -254,8 +254,7 @@ class Client(QueryMethods):
             if payload is None:
                 # Skip the remaining batches: with a frozen server each would cost a timeout.
                 self._count_unanswered(k - start)
-                bounded = has_tolerance_or_budget(options)
-                parts.append(question.unknown(k - start, bounded=bounded))
+                parts.append(question.unknown(k - start, bounded=bool(options.get("tolerance"))))
                 break
             parts.append(question.check(decode_answer(question.answers, payload), stop - start))
             start = stop
@@ -314,7 +313,7 @@ class Client(QueryMethods):
         request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
         question = QUESTIONS[op]
         total = question.items_along(len(array))
-        return self._parts(question, encode(request), name, total, has_tolerance_or_budget(parameters))
+        return self._parts(question, encode(request), name, total, bool(parameters.get("tolerance")))
 
     def _parts(
         self, question: Question[Any], request: bytes, name: str, total: int, bounded: bool

@@ -79,8 +79,7 @@ class QueryMethods:
     and from rotations of float32 numbers, which are rounded too far to be accepted.
     margin: distance below which two spheres count as in contact [m].
     reach: farthest distance worth reporting [m].
-    options: budget_ms, budget_visits, radius_model, and of some queries tolerance [m] and
-    relative_tolerance: WIRE.md.
+    options: budget_ms, radius_model, and of some queries tolerance [m] and relative_tolerance: WIRE.md.
     """
 
     # Names of the options that `ask` takes besides those of the question.

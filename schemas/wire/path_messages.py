@@ -13,7 +13,7 @@ from .arrays import Poses, array_fields
 from .question_rules import Rows, suggestion_for
 from .question_table import path_questions, question_of
 from .request_limits import MAX_CONTACTS
-from .requests import Count, Duration, Length, ModelName, Name, Request, Share
+from .requests import Duration, Length, ModelName, Name, Request, Share
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -40,7 +40,6 @@ class PathRequest(Request, frozen=True):
     tolerance: Length | None = None
     relative_tolerance: Share | None = None
     budget_ms: Duration | None = None
-    budget_visits: Count | None = None
     radius_model: ModelName | None = None
 
     def __post_init__(self) -> None:

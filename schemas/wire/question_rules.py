@@ -242,8 +242,7 @@ class Question(Generic[A]):
         """Return answers for k items (poses, rays, points, motions, objects), all `UNKNOWN`.
 
         They stand for a request that was not answered.
-        bounded: whether columns with `Rows.BOUNDED` have values, as they do if a tolerance or a
-        budget was given.
+        bounded: whether columns with `Rows.BOUNDED` have values, as they do if a tolerance was given.
         """
         rows = {
             Rows.ITEMS: k,

@@ -5,7 +5,7 @@ A client therefore fails before it sends a request that a server would refuse.
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Annotated, Any, TypedDict, get_type_hints
 
@@ -80,13 +80,11 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
     """Parameters that every query takes.
 
     budget_ms: time for loading and computing together [ms]; null: no limit.
-    budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
     optional factor as in local:0.8, or fixed:METRES; null: the scene's default.
     """
 
     budget_ms: Duration | None = None
-    budget_visits: Count | None = None
     radius_model: ModelName | None = None
 
     def arguments(self) -> tuple[Any, ...]:
@@ -116,15 +114,7 @@ class QuestionOptions(TypedDict, total=False):
     """Fields of `QuestionRequest` as keyword arguments, for this module and every query method."""
 
     budget_ms: float | None
-    budget_visits: int | None
     radius_model: str | None
-
-
-def has_tolerance_or_budget(options: Mapping[str, Any]) -> bool:
-    """Return True if the options of a query allow anything but an exact answer."""
-    return bool(options.get("tolerance")) or any(
-        options.get(name) is not None for name in ("budget_ms", "budget_visits")
-    )
 
 
 class CollideRequest(TolerantRequest, frozen=True):

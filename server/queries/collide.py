@@ -12,11 +12,18 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.scene_arrays import NO_LIMIT
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .context.level_of_detail import below, find_level, level_budget, level_reach
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, check_request, in_unknown, kernel_poses, to_units
+from .context.query_context import (
+    LevelOfDetail,
+    SceneData,
+    check_request,
+    in_unknown,
+    kernel_poses,
+    to_units,
+    with_stop,
+)
 from .resolve import Steps, drop_items, load_and_search, resolve, run
 
 
@@ -64,10 +71,9 @@ def collide_steps(
         return drop_items(lists, settled)
 
     if len(avatar.points):
-        left = yield from resolve(
-            data, reach.lists, _search(data, avatar, array, reach, budget.tolerance_units, verdict, counts), budget,
-            spent, settle,
-        )  # fmt: skip
+        own = with_stop(data, budget.stop)
+        search = _search(own, avatar, array, reach, budget.tolerance_units, verdict, counts)
+        left = yield from resolve(data, reach.lists, search, budget, spent, settle)
         verdict[(left < np.inf) & (verdict == CLEAR)] = UNKNOWN
         # A load may have proved the index wrong by now.
         if data.nothing_clear or len(data.unknown):
@@ -92,7 +98,7 @@ def _search(
     ) -> None:
         own = reach._replace(lists=lists)
         collide_poses(
-            poses, avatar.arrays, data.arrays, own, which, cursor, state, tolerance_units, NO_LIMIT, verdict, counts
+            poses, avatar.arrays, data.arrays, own, which, cursor, state, tolerance_units, verdict, counts
         )  # fmt: skip
 
     return search
@@ -155,7 +161,7 @@ def verdict_bounds(
     radii: (k,) sum of the largest radii of avatar and scan, exact units: the depth limit of a pair.
     margin: [m].  margin_units: the margin as rounded, up or down; verdicts are based on it.
     """
-    if budget.tolerance == 0 and not budget.limited:
+    if budget.tolerance == 0:
         return {}
     rounded, k = margin_units / UNITS_PER_METRE, len(verdict)
     low, high = min(float(margin), rounded), max(float(margin), rounded)

@@ -47,7 +47,7 @@ from ..runtime.stop_flag import NO_STOP
 from .collide import clear_of_rows
 from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units
+from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
 from .context.signed_distance import signed_from_square
 from .resolve import Steps, drop_items, resolve, run
 
@@ -94,7 +94,7 @@ def contacts_steps(
     The deepest pair has the least |a - b| - r_a - r_b, with r_b of the scan point's own sphere,
     compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
     Ties are ordered by scan point, avatar centre, avatar row, scan number.
-    budget: a budget may leave pairs out; `exact` is then false, the pairs counted are the least
+    budget: a deadline may leave pairs out; `exact` is then false, the pairs counted are the least
     number, and the listed ones are in contact but may not be the deepest. With a tolerance, and
     where voxels are late, the scene's level of detail may prove a pose clear without them; pairs
     are counted exactly all the same, because a count cannot end early (DESIGN.md, "Tolerance").
@@ -115,10 +115,12 @@ def contacts_steps(
         avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS
     )  # fmt: skip
 
+    arrays = with_stop(data, budget.stop).arrays
+
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         nonlocal memory
         own = reach._replace(lists=lists)
-        memory = gather_contacts(array, avatar.arrays, data.arrays, own, *state, options, memory, tally)
+        memory = gather_contacts(array, avatar.arrays, arrays, own, *state, options, memory, tally)
         _check_room(memory)
 
     def settle(lists: VoxelLists) -> Steps[VoxelLists]:

@@ -13,13 +13,12 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import DistanceAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.scene_arrays import NO_LIMIT
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.level_of_detail import below, find_level, level_budget, level_reach
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, check_request, kernel_poses, to_units
+from .context.query_context import LevelOfDetail, SceneData, check_request, kernel_poses, to_units, with_stop
 from .context.signed_distance import distance_columns, unknown_gaps
 from .resolve import Search, Steps, drop_items, load_and_search, resolve, run
 
@@ -82,7 +81,9 @@ def distance_steps(
         return drop_items(lists, _is_within(nearest, units, around.units, budget))
 
     if len(avatar.points):
-        search = _search(data, avatar, array, around, reach_units, budget, nearest, counts)
+        search = _search(
+            with_stop(data, budget.stop), avatar, array, around, reach_units, budget, nearest, counts
+        )
         left = yield from resolve(data, around.lists, search, budget, spent, settle)
         missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
         np.minimum(missing, resident_bound, out=nearest.missing_bound)
@@ -117,7 +118,7 @@ def _search(
     ) -> None:
         own = reach._replace(lists=lists)
         nearest_poses(
-            poses, avatar.arrays, data.arrays, own, which, cursor, state, beyond, budget.relative, tolerance, NO_LIMIT,
+            poses, avatar.arrays, data.arrays, own, which, cursor, state, beyond, budget.relative, tolerance,
             nearest, counts,
         )  # fmt: skip
 

@@ -12,7 +12,7 @@ from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
 from .collide import clear_of_rows
 from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units
+from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
 from .resolve import Steps, drop_items, resolve, run
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.
@@ -49,7 +49,7 @@ def separation_per_scan(
     of its deepest pair, except for the last bits: if the separations of several pairs differ only
     by rounding, it is that of one of them. A point whose number belongs to no scan counts as
     ANY_SCAN.
-    budget: a budget may leave pairs out; `exact` is then false.
+    budget: a deadline may leave pairs out; `exact` is then false.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     poses = kernel_poses(np.asarray(pose)[None])
@@ -62,9 +62,11 @@ def separation_per_scan(
     nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, lists, level = np.zeros(3, np.int64), reach.lists, find_level(data, budget)
 
+    arrays = with_stop(data, budget.stop).arrays
+
     def search(lists: VoxelLists, _: NDArray[np.int64], *state: NDArray[Any]) -> None:
         own = reach._replace(lists=lists)
-        nearest_by_scan(poses, avatar.arrays, data.arrays, own, *state, margin_units, nearer, counts)
+        nearest_by_scan(poses, avatar.arrays, arrays, own, *state, margin_units, nearer, counts)
 
     def settle(lists: VoxelLists) -> Steps[VoxelLists]:
         if level is None or not lists.starts[-1]:

@@ -4,12 +4,11 @@ An engine takes the data of one archive, the avatar if the question is about one
 the request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...schemas.wire.answers import SweepAnswers
 from ...schemas.wire.question_rules import Question
@@ -23,11 +22,10 @@ from ...schemas.wire.question_table import (
     SWEEP,
     WITHIN,
 )
-from ...schemas.wire.warming_parts import BUDGETS, MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, LateVoxels, QueryBudget
+from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
@@ -94,27 +92,3 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
         run(QUESTIONS[part], EXACT)
     if part == COLLIDE.name:
         run(COLLIDE, QueryBudget(tolerance=1e-3))
-    if part == BUDGETS:
-        # These limits are too large to be reached here.
-        for budget in (
-            QueryBudget(tolerance=1e-3),
-            QueryBudget(deadline=time.perf_counter() + 3600.0),
-        ):
-            for question in QUESTIONS.values():
-                run(question, budget)
-    if part == MOTION:
-        _warm_late(data, avatar, pose)
-
-
-def _warm_late(data: SceneData, avatar: AvatarModel, pose: NDArray[np.float64]) -> None:
-    """Run the queries of frames that do not wait, as if no voxel were in memory.
-
-    With the level of detail, and without it.
-    """
-    nowhere = data._replace(arrays=data.arrays._replace(where=np.full_like(data.arrays.where, -1)))
-    aside = pose.copy()
-    aside[0, 0, 3] += 0.01
-    for each in (nowhere, nowhere._replace(level=None)):
-        budget = QueryBudget(late=LateVoxels())
-        collide(each, avatar, pose, 0.0, budget)
-        sweep(each, avatar, pose, aside, budget=budget)

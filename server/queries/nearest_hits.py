@@ -14,7 +14,7 @@ from ...schemas.wire.requests import make_vectors
 from ..kernels.core.reach import Items, VoxelLists, find_lists
 from ..kernels.rays.rays import ClosestHits, RayBatch
 from .context.query_budget import CostCounter, QueryBudget
-from .context.query_context import SceneData
+from .context.query_context import SceneData, with_stop
 from .resolve import Steps, drop_items, resolve
 
 # Rays or points whose lists are in memory at a time.
@@ -56,6 +56,7 @@ def find_hits(
         np.full(k, np.inf), np.full(k, -1, np.int64), np.zeros((k, 3), np.int64), np.full(k, np.inf),
         np.zeros((3, k), np.uint32),
     )  # fmt: skip
+    arrays = with_stop(data, budget.stop).arrays
     for begin in range(0, k, BATCH):
         rows = slice(begin, min(begin + BATCH, k))
         part = ClosestHits(
@@ -68,7 +69,7 @@ def find_hits(
         def search(
             lists: VoxelLists, *state: NDArray[Any], batch: RayBatch = batch, part: ClosestHits = part
         ) -> None:
-            kernel(batch, lists, *state, data.arrays, part)
+            kernel(batch, lists, *state, arrays, part)
 
         def settle(lists: VoxelLists, part: ClosestHits = part) -> Steps[VoxelLists]:
             """Drop the rays that hit something before their next voxel."""

@@ -18,15 +18,13 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxels_in_reach import check_poses
-from ..runtime.stop_flag import NO_STOP
+from ..runtime.stop_flag import NO_STOP, StoppedError
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .resident_fast_path import collide_fast
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
-# Pairs tested between two checks of a deadline.
-PAIRS_PER_CHECK = 64
 
 
 class CheckedObjects(NamedTuple):
@@ -73,8 +71,8 @@ def objects(
     common with the other's mask. The scene's group is SCENE_GROUP, and its mask has all bits.
     margin: of each pair, and of each object with the scene [m].
     NUMERICS.md N5 defines contact, also between two objects: kernels/bodies/body_pairs.py. A radius
-    model applies to the scan's spheres and not to objects. Visits are counted for each object and
-    each pair. Pairs left untested by a budget are listed as UNKNOWN.
+    model applies to the scan's spheres and not to objects. Pairs left untested by a deadline are
+    listed as UNKNOWN.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
@@ -86,10 +84,11 @@ def objects(
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
-        if budget.spent:
+        try:
+            found = collide_fast(data, model, checked.poses[rows], margin, budget)
+        except StoppedError:
             verdict[rows] = UNKNOWN
             continue
-        found = collide_fast(data, model, checked.poses[rows], margin, budget)
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)
@@ -181,7 +180,7 @@ def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[ND
 def _touching_pairs(
     checked: CheckedObjects, origin: NDArray[np.float64], budget: QueryBudget
 ) -> ObjectContacts:
-    """Test the pairs; without a deadline, those of the same two avatars in one kernel call."""
+    """Test the pairs, those of the same two avatars in one kernel call."""
     pairs, filtered = find_pairs(checked, origin)
     kinds = checked.model_of[pairs]
     # Contact is symmetric, so two avatars are tested in one order only.
@@ -197,22 +196,17 @@ def _touching_pairs(
     counters = np.zeros(2, np.int64)
     tested = 0
     for first, last in zip(firsts.tolist(), [*firsts[1:].tolist(), len(order)], strict=False):
-        if budget.spent:
+        if budget.stop:
             break
         rows = order[first:last]
         a, b = divmod(int(kind[rows[0]]), models)
-        step = PAIRS_PER_CHECK if budget.deadline < np.inf else len(rows)
-        for begin in range(0, len(rows), step):
-            if budget.spent:
-                break
-            part = rows[begin : begin + step]
-            found = np.empty(len(part), np.uint8)
-            touch_pairs(
-                checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.units,
-                ordered[part], checked.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
-            )  # fmt: skip
-            verdict[part] = found
-            tested += len(part)
+        found = np.empty(len(rows), np.uint8)
+        touch_pairs(
+            checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.units, ordered[rows],
+            checked.margin_units, origin, budget.stop.flag, found, counters,
+        )  # fmt: skip
+        verdict[rows] = found
+        tested += len(rows)
     listed = verdict != CLEAR
     visits, tests = counters.tolist()
     return ObjectContacts(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)

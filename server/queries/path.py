@@ -42,12 +42,12 @@ Ask = Callable[[int, int], Cost]
 
 
 class AskPart(Protocol):
-    """Function that computes answers [start, end) of a path.
+    """Function that computes answers [start, end) of a path, which form a part.
 
-    part: stop flag of the part that contains them; None: they form a part.
+    begun: when the part began, on time.perf_counter()'s clock [s]; None: now.
     """
 
-    def __call__(self, start: int, end: int, part: StopFlag | None = None) -> Cost: ...
+    def __call__(self, start: int, end: int, begun: float | None = None) -> Cost: ...
 
 
 def path_question(
@@ -69,11 +69,7 @@ def path_question(
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
-    budgets = {
-        name: given.pop(name)
-        for name in ("relative_tolerance", "budget_ms", "budget_visits")
-        if name in given
-    }
+    budgets = {name: given.pop(name) for name in ("relative_tolerance", "budget_ms") if name in given}
     question, engine = QUESTIONS[op], ENGINES[op]
     tolerance = given.pop("tolerance", question.other_defaults.get("tolerance", 0.0))
     # The voxels along a path are used once. Half of the cache is left for those at users'
@@ -85,32 +81,32 @@ def path_question(
     units = np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.stop).arrays, units
+        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.request).arrays, units
     )
     refuse(fault, pose, found)
 
-    def ask(start: int, end: int, part: StopFlag | None = None) -> Cost:
-        if budget.spent:
+    def ask(start: int, end: int, begun: float | None = None) -> Cost:
+        if budget.stop:
             return unknown_answers(question, end - start, budget)
         what = [poses[start:end], poses[start + 1 : end + 1]] if question.moving else [poses[start:end]]
-        own = budget._replace(stop=part_stop(budget.stop, stop.part_seconds) if part is None else part)
+        own = budget._replace(stop=part_stop(budget.stop, stop.part_seconds, begun))
         return ask_until_stopped(
             question,
             end - start,
             own,
-            lambda: engine(with_stop(data, own.stop), avatar, *what, **given, budget=own),
+            lambda: engine(with_stop(data, own.request), avatar, *what, **given, budget=own),
         )
 
     return ask, question.items_along(len(poses))
 
 
-def part_stop(stop: StopFlag, seconds: float) -> StopFlag:
-    """Return the stop flag of a part that begins now: set after `seconds` or with the path's."""
+def part_stop(stop: StopFlag, seconds: float, begun: float | None) -> StopFlag:
+    """Return the stop flag of a part: set after `seconds` or with the path's. begun: see `AskPart`."""
     if seconds == math.inf:
         return stop
     part = stop.part()
     reason = f"a part took longer than {seconds:g} s, the most that this server spends on one"
-    stop_at(part, time.perf_counter() + seconds, reason)
+    stop_at(part, (time.perf_counter() if begun is None else begun) + seconds, reason)
     return part
 
 

@@ -10,7 +10,7 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.rays.rays import follow_rays
+from ..kernels.rays.rays import ClosestHits, follow_rays
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
 from .nearest_hits import find_hits, make_origins, verdict_and_bounds

@@ -7,7 +7,6 @@ The engine is called instead if
 - a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
 - the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds
 MAX_FAST_REACH,
-- the request has a budget of time or visits, or
 - a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).
 
 The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
@@ -66,13 +65,7 @@ def collide_fast(
     """Answer `collide`, in one kernel call if there is one pose and the fast path applies."""
     begin = time.perf_counter()
     array = kernel_poses(poses)
-    if (
-        len(array) != 1
-        or len(avatar.points) > MAX_FAST_POINTS
-        or budget.tolerance
-        or budget.limited
-        or _has_unknown(data)
-    ):
+    if len(array) != 1 or len(avatar.points) > MAX_FAST_POINTS or budget.tolerance or _has_unknown(data):
         return collide(data, avatar, array, margin, budget)
     residency = data.residency
     verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
@@ -80,7 +73,7 @@ def collide_fast(
     body, held = refer_to_avatar(avatar.arrays), data.references.to(data.arrays, data.tree)
     with residency.frozen():
         fault, found, needed = held.call(
-            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, data.arrays.stop, verdict,
+            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, budget.stop.flag, verdict,
             counts,
         )  # fmt: skip
         outside = held.outside.copy()
@@ -113,7 +106,6 @@ def distance_fast(
         len(poses) != 1
         or not 0.0 <= reach <= MAX_FAST_REACH
         or len(avatar.points) > MAX_FAST_POINTS
-        or budget.limited
         or _has_unknown(data)
     ):
         return distance(data, avatar, poses, reach, budget)
@@ -125,7 +117,7 @@ def distance_fast(
     with residency.frozen():
         fault, found, needed, visits, tests = held.call(
             nearest_resident, poses, body, avatar.radius, data.radius_units, reach_units, float(reach), held.reference,
-            data.arrays.stop, result,
+            budget.stop.flag, result,
         )  # fmt: skip
         outside = held.outside.copy()
         if needed > 0:
@@ -228,14 +220,14 @@ class ResidentQueries:
 
         skin: distance to keep from a contact [m], for `SweepResult.end`; negative: not requested.
         """
-        if self._small and not budget.limited:
+        if self._small:
             residency, result = data.residency, self._result
             self._first[:], self._last[:] = pose_from, pose_to
             held = data.references.to(data.arrays, data.tree)
             with residency.frozen():
                 needed, verdict, visits, _, _ = held.call(
                     sweep_resident, self._first, self._last, self.body.reference, self._scratch, self.avatar.radius,
-                    data.radius_units, self._box, held.reference, data.arrays.stop, data.nothing_clear,
+                    data.radius_units, self._box, held.reference, budget.stop.flag, data.nothing_clear,
                     max(tolerance, budget.tolerance), skin, result,
                 )  # fmt: skip
                 if needed > 0:
@@ -247,8 +239,8 @@ class ResidentQueries:
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
-        # A budget may leave places unexamined too.
-        partial = budget.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
+        # A stop may leave places unexamined too.
+        partial = bool(budget.stop) or _has_unknown(data)
         return SweepResult(
             verdict,
             float(answers.lower[0]),
@@ -329,7 +321,7 @@ class ResidentQueries:
 
     def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits of `collide` for a pose (4, 4)."""
-        if self._small and not budget.limited and not _has_unknown(data):
+        if self._small and not _has_unknown(data):
             residency = data.residency
             held = data.references.to(data.arrays, data.tree)
             poses, verdict, counts = self._poses, self._verdict, self._counts
@@ -337,7 +329,7 @@ class ResidentQueries:
             with residency.frozen():
                 fault, found, needed = held.call(
                     collide_resident, poses, self.body.reference, self.avatar.radius, data.radius_units,
-                    budget.tolerance_units, held.reference, data.arrays.stop, verdict, counts,
+                    budget.tolerance_units, held.reference, budget.stop.flag, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
                     self.use(residency, held.rows[:needed].tolist())

@@ -95,7 +95,7 @@ def load_and_search(
     cursor, ends = lists.starts[:-1].copy(), lists.starts[1:]
     state: NDArray[np.uint8] = np.zeros(len(where), np.uint8)
     looked: NDArray[np.bool_] = np.zeros(len(where), bool)
-    while len(open_ := np.flatnonzero(cursor < ends)) and not budget.spent:
+    while len(open_ := np.flatnonzero(cursor < ends)) and not budget.stop:
         if together:
             open_, rows = _whole_items(data, lists, cursor, open_)
         else:

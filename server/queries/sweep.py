@@ -12,7 +12,6 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.scene_arrays import NO_LIMIT
 from ..kernels.core.voxels_in_reach import check_poses
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
@@ -23,9 +22,10 @@ from ..kernels.motion.sweep_segments import (
     make_plan_space,
     plan_segments,
 )
+from ..runtime.stop_flag import StoppedError
 from .context.level_of_detail import below, find_level, level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, kernel_poses, refuse, to_units
+from .context.query_context import LevelOfDetail, SceneData, kernel_poses, refuse, to_units, with_stop
 from .resolve import Steps, drop_items, resolve, run
 
 # `tolerance` of a request that gives none [m].
@@ -147,7 +147,7 @@ def sweep_steps(
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
-        np.full(k, NO_LIMIT, np.int64), np.zeros(k), np.zeros(k),
+        np.zeros(k), np.zeros(k),
     )  # fmt: skip
     counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
     proved = np.ones(k)
@@ -157,9 +157,11 @@ def sweep_steps(
     spent = CostCounter(begin, data.residency, data.keys)
     level = find_level(data, budget)
 
+    arrays = with_stop(data, budget.stop).arrays
+
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         advance_segments(
-            box, first, last, avatar.arrays, units, data.arrays, lists,
+            box, first, last, avatar.arrays, units, arrays, lists,
             *state, tolerance, scratch, progress, counts,
         )  # fmt: skip
 
@@ -176,7 +178,7 @@ def sweep_steps(
     which = np.arange(k)
     if part is not None:
         progress.at[:] = part.at
-    while len(which) and not budget.spent:
+    while len(which) and not budget.stop:
         lists = _plan(data, avatar, box, first, last, units, which, progress)
         if lists is None:
             break
@@ -261,7 +263,7 @@ def _clear_until(
         found = yield from sweep_steps(
             covers, avatar, first, last, margin, within, level_budget(budget), part
         )
-    except (BadRequestError, TooLargeError):  # cover spheres are larger than those of the scene
+    except (BadRequestError, TooLargeError, StoppedError):  # cover spheres are larger than those of the scene
         return np.zeros(len(first))
     own.add_cost(found)
     spent.add_level(own)

@@ -181,12 +181,6 @@ class UserTracks:
         self._origin = np.array(origin, np.float64)
         self._lock = threading.Lock()
         self._users: dict[User, _Track] = {}
-        # The predicted paths of the last plan [steps] and the plan's number; replaced, never
-        # written. `_distances` is the distance of each row from these paths [m], valid where
-        # `_distance_plan` equals the plan's number. The system commits the pages of both as rows
-        # are queried.
-        self._planned_paths = np.empty((0, PIECES + 1, 3)), 1
-        self._distance_plan, self._distances = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
 
     @property
     def users(self) -> list[User]:
@@ -243,7 +237,6 @@ class UserTracks:
         horizon, late = ahead.horizon(load_seconds), np.maximum(now - users.last, 0.0)
         seconds = np.where(late <= STALE, late + horizon, 0.0)
         paths = (_predict_paths(users, ahead, seconds) - self._origin) / self._step
-        self._planned_paths = paths, self._planned_paths[1] + 1
         reaches = self._spans(users.reaches)
         rings = np.where(now - users.since >= ahead.settled, ahead.ring / self._step, 0.0)
         # Boxes of four pieces each, and one around the start.

@@ -2,6 +2,8 @@
 
 A flag is set when the request's time is up, its client has disconnected or the server stops.
 Kernels read it every few microseconds and return; what they have not examined by then is `unknown`.
+The deadline that a request names itself sets a part of its flag, without a reason: the answer is as
+asked for. Whatever else stops it gives a reason, which the answer carries.
 """
 
 import heapq
@@ -28,7 +30,8 @@ class StopFlag:
     """Flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
     flag: (1,) int64, 0 until it is set; kernels read it without a lock.
-    reason: reason for which it was set, for the answer; "" until then.
+    reason: reason for which it was set, for the answer; "" until then, and at the request's own
+    deadline.
     part_seconds: time limit of one part of an answer in parts [s].
     """
 
@@ -166,7 +169,10 @@ _DEADLINES = Deadlines()
 
 def stop_at(stop: StopFlag, when: float, reason: str) -> None:
     """Set `stop` at `when`, on time.perf_counter()'s clock [s], if it is still referenced then."""
-    _DEADLINES.add(stop, when, reason)
+    if when <= time.perf_counter():
+        stop.set(reason)
+    else:
+        _DEADLINES.add(stop, when, reason)
 
 
 def start_deadlines() -> None:

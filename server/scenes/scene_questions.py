@@ -16,7 +16,7 @@ from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.question_rules import Question
 from ...schemas.wire.requests import make_objects, make_vectors
 from ..archives.archive_generation import ArchiveGeneration
-from ..archives.ask_archives import PathParts, PreparedQuery, Rows, ask_along, ask_each, make_legs, rows_of
+from ..archives.ask_archives import PathParts, PreparedQuery, ask_along, ask_each, make_legs
 from ..archives.merge_answers import limit_pairs
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
@@ -66,8 +66,8 @@ class SceneQuestions(QueryMethods):
         client: owner of the avatars.
         options: the remaining fields by name, and
 
-        - budget_ms and budget_visits, and tolerance [m] and relative_tolerance of questions that take
-          them: see server/queries/context/query_budget.py,
+        - budget_ms, and tolerance [m] and relative_tolerance of questions that take them: see
+          server/queries/context/query_budget.py,
         - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
           scene's default,
         - stop: stop flag that ends the work early.
@@ -104,8 +104,8 @@ class SceneQuestions(QueryMethods):
             except StoppedError:
                 answers = unknown_answers(question, _count(question, rows), budget)
             else:
-                if budget.stop:
-                    answers = structs.replace(answers, stopped=budget.stop.reason)
+                if budget.stopped:
+                    answers = structs.replace(answers, stopped=budget.stopped)
         self._metrics.answered(*user, answers)
         return answers
 
@@ -139,10 +139,8 @@ class SceneQuestions(QueryMethods):
         def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> PreparedQuery:
             own = [archive.poses_in(each) for each in arrays]
 
-            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
-                answers: _A = engine(
-                    data, avatar, *(rows_of(each, rows) for each in own), *what, budget=budget
-                )
+            def ask(data: SceneData, budget: QueryBudget) -> _A:
+                answers: _A = engine(data, avatar, *own, *what, budget=budget)
                 return answers
 
             return ask, opened.record_user((client, name), avatar, own[-1], around)
@@ -167,8 +165,8 @@ class SceneQuestions(QueryMethods):
                 for each, name in zip(arrays, names, strict=True)
             ]
 
-            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
-                answers: _A = engine(data, *(rows_of(each, rows) for each in own), *what, budget=budget)
+            def ask(data: SceneData, budget: QueryBudget) -> _A:
+                answers: _A = engine(data, *own, *what, budget=budget)
                 return answers
 
             return ask, False
@@ -193,9 +191,8 @@ class SceneQuestions(QueryMethods):
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
             mask = masks if first else masks & np.uint32(SCENE_GROUP)
 
-            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
-                k = slice(None) if rows is None else rows
-                answers: _A = engine(data, avatars[k], own[k], group[k], mask[k], *what, budget=budget)
+            def ask(data: SceneData, budget: QueryBudget) -> _A:
+                answers: _A = engine(data, avatars, own, group, mask, *what, budget=budget)
                 return answers
 
             return ask, False
@@ -258,14 +255,13 @@ def _terms(
     tolerance: float = 0.0,
     relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
-    budget_visits: int | None = None,
     radius_model: str | None = None,
     stop: StopFlag = NO_STOP,
 ) -> tuple[SceneData, QueryBudget]:
     """Return the scene data and the budget of a request with these options."""
-    budget = make_budget(tolerance, relative_tolerance, budget_ms, budget_visits, stop)
+    budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
-    return with_stop(data, budget.stop), budget
+    return with_stop(data, budget.request), budget
 
 
 def _count(question: Question[Any], rows: ArrayLike) -> int:

@@ -358,7 +358,7 @@ class Simulation:
 
 def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:
     """Return the budget of a frame's queries. late: as in `Wish`."""
-    return QueryBudget(stop=stop, late=LateVoxels() if late == BOUNDS else None)
+    return QueryBudget(stop=stop, request=stop, late=LateVoxels() if late == BOUNDS else None)
 
 
 def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:

@@ -29,7 +29,7 @@ from ...schemas.wire.requests import AddAvatarRequest, QuestionRequest
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ReloadAnswer, ScenesAnswer
 from ...schemas.wire.stats import StatsRequest
 from ...schemas.wire.tile_messages import TileRequest, VoxelsRequest
-from ...schemas.wire.warming_parts import MOTION, needed_parts
+from ...schemas.wire.warming_parts import MOTION, needed_part
 from ..runtime.stop_flag import NO_STOP, StopFlag
 from ..scene_interface import (
     AvatarShape,
@@ -257,7 +257,7 @@ class RequestDispatcher:
         self._check_size(operation, request)
         if not self.warming.complete:
             asked_for = request.op if isinstance(request, PathRequest) else route.operation
-            self.warming.check(*needed_parts(asked_for, structs.asdict(request)))
+            self.warming.check(needed_part(asked_for))
         return operation.ask(scene, request, route.client, stop)
 
     def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:

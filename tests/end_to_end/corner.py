@@ -54,8 +54,8 @@ QUESTIONS = {
         40,
     ),
     "collide-bounded": (
-        lambda scene: scene.collide("al", POSES, tolerance=0.01, budget_visits=30),
-        CollideRequest("al", POSES, tolerance=0.01, budget_visits=30),
+        lambda scene: scene.collide("al", POSES, tolerance=0.01),
+        CollideRequest("al", POSES, tolerance=0.01),
         CollideAnswers,
         40,
     ),

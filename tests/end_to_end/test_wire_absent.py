@@ -70,7 +70,7 @@ def test_a_frozen_server_is_unknown_after_the_timeout(endpoint, monkeypatch):
     "ask",
     [
         lambda client: client.collide("al", PATH),
-        lambda client: client.collide("al", PATH, budget_visits=5),
+        lambda client: client.collide("al", PATH, tolerance=0.1),
         lambda client: client.distance("al", PATH, 1.0),
         lambda client: client.contacts("al", PATH),
         lambda client: client.sweep("al", PATH, PATH),
@@ -78,7 +78,7 @@ def test_a_frozen_server_is_unknown_after_the_timeout(endpoint, monkeypatch):
         lambda client: client.within(PATH[:, :3, 3], 1.0),
         lambda client: client.objects([("al", pose) for pose in PATH]),
     ],
-    ids=["collide", "budget", "distance", "contacts", "sweep", "raycast", "within", "objects"],
+    ids=["collide", "tolerance", "distance", "contacts", "sweep", "raycast", "within", "objects"],
 )
 def test_every_question_that_nobody_answers_is_unknown(endpoint, ask):
     with Client(endpoint, scene="floor") as client:

@@ -51,7 +51,6 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
     items = [(("body", "box")[i % 2], pose, 1 + i % 3) for i, pose in enumerate(poses)]
     return {
         "collide": scene.collide("body", poses),
-        "collide within a tolerance": scene.collide("body", poses, 0.002, tolerance=1e-3, budget_visits=200),
         "collide, early": scene.collide("body", poses, 0.002, tolerance=0.02),
         "distance": scene.distance("body", poses, 0.1),
         "distance within 30 %": scene.distance("body", poses, 0.1, relative_tolerance=0.3),

@@ -1,10 +1,14 @@
 """Hard cases of answers that are not exact; a test's number is its row in NUMERICS.md."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import archive_cases
 import numpy as np
 import pytest
+import stopped_midway
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.core.scene_arrays import Arena
@@ -80,35 +84,14 @@ def test_case_33_a_share_of_nothing_allows_a_millimetre(tmp_path: Path, rng: np.
 
 
 @pytest.mark.case(
-    34, "budgets of 0, 1 and 2 visits for every query that takes one: bounds hold, none is clear unseen"
+    34, "a stop at any look of any query at its flag: bounds hold, nothing is clear that was not examined"
 )
-@pytest.mark.parametrize("visits", [0, 1, 2])
-def test_case_34_with_hardly_a_visit_bounds_hold(
-    tmp_path: Path, rng: np.random.Generator, visits: int
-) -> None:
-    points = rng.uniform(0, 1, (300, 3)) * [1, 1, 0.1]
+def test_case_34_stopped_midway_bounds_hold(tmp_path: Path) -> None:
+    points, _ = stopped_midway.scan_and_avatar()
     case = archive_cases.build(tmp_path, points, voxel=0.4, leaf=4, degree=3, cell_points=30, radius=0.01)
-    body = rng.uniform(-0.1, 0.1, (20, 3))
-    poses = archive_cases.near_poses(rng, points, body, 20, 0.4)
-    with Scene.open(case.archive) as scene:
-        scene.add_avatar("body", body, 0.01)
-        signed = scene.distance("body", poses, 3.0).signed_distance
-        touch = scene.collide("body", poses, budget_visits=visits)
-        assert (touch.lower <= np.minimum(signed, 0.0)).all() and (touch.upper >= signed).all()
-        assert (signed[touch.verdict == Verdict.CLEAR] > 0).all()
-        assert (signed[touch.verdict == Verdict.CONTACT] <= 0).all()
-        assert (touch.node_visits <= visits).all() and (touch.verdict == Verdict.UNKNOWN).any()
-        near = scene.distance("body", poses, 3.0, budget_visits=visits)
-        assert (near.lower <= signed).all() and (near.upper >= signed).all()
-        assert (signed[near.verdict == Verdict.CLEAR] > 0).all() and (near.node_visits <= visits).all()
-        moves = scene.sweep("body", poses[:-1], poses[1:], budget_visits=visits)
-        full = scene.sweep("body", poses[:-1], poses[1:])
-        assert (moves.lower <= full.upper).all()
-        assert (full.verdict[moves.verdict == Verdict.CLEAR] == Verdict.CLEAR).all()
-        at = poses[:, :3, 3].copy()
-        true, found = scene.within(at, 2.0), scene.within(at, 2.0, budget_visits=visits)
-        assert (found.lower <= true.distance).all() and (found.upper >= true.distance).all()
-        down = np.tile([0.0, 0.0, -1.0], (len(at), 1))
-        true, found = scene.raycast(at, down, 5.0), scene.raycast(at, down, 5.0, budget_visits=visits)
-        assert (found.lower <= np.where(np.isinf(true.distance), 5.0, true.distance)).all()
-        assert (true.verdict[found.verdict == Verdict.CLEAR] == Verdict.CLEAR).all()
+    path = os.pathsep.join([str(Path(stopped_midway.__file__).parent), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", stopped_midway.__file__, str(case.archive)],
+        env=os.environ | {"PYTHONPATH": path, "NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr

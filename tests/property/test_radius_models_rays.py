@@ -18,7 +18,6 @@ from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from sample_sizes import sample
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
@@ -128,9 +127,6 @@ def test_objects_touch_the_scene_by_its_own_spheres_and_one_another_as_ever(
             asked = [models[i] for i in of], poses, np.ones(60, int), everything, 0.01
             found = objects(data, *asked)
             assert (found.verdict == 1).tolist() == expected
-            few = objects(data, *asked, QueryBudget(visits=3))
-            assert not (few.verdict == 1)[~np.array(expected)].any()
-            assert not (few.verdict == 0)[expected].any()
             seen[model] = found.pairs.tolist()
         assert 3 < sum(expected) < 57, model
     assert len({str(pairs) for pairs in seen.values()}) == 1 and seen[None]

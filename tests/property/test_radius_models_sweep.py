@@ -42,9 +42,7 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
     way=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
     turn=st.sampled_from([0.0, 1e-6, 0.1, np.pi]),
     margin=st.sampled_from([0.0, 0.02]),
-    budget=st.sampled_from(
-        [QueryBudget(), QueryBudget(), QueryBudget(tolerance=1e-3), QueryBudget(visits=60)]
-    ),
+    budget=st.sampled_from([QueryBudget(), QueryBudget(), QueryBudget(tolerance=1e-3)]),
     model=st.sampled_from(radius_class_archives.MODELS),
     tree=TREES,
 )

@@ -27,8 +27,9 @@ def count_within(
         low = cell * size
         away = np.maximum(np.maximum(low - units, units - (low + size)), 0.0)
         near = (away * away).sum(axis=1) <= float(reach_units + 1) ** 2
-        near &= visits < budget.visits
-        if not near.any():
+        if budget.stop:
+            exact &= ~near
+        if budget.stop or not near.any():
             continue
         with data.residency.hold([row], budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             if scene.where[row, 0] < 0 or held.late:
@@ -42,7 +43,7 @@ def count_within(
                     tests[i] += len(stored)
                     visits[i] += 1
         spent.add(held)
-    exact &= (missing == 0) & (visits < budget.visits)
+    exact &= missing == 0
     for low, high in data.unknown * scene.units_per_step:
         exact &= ((units + reach_units < low) | (units - reach_units > high)).any(axis=1)
     verdict = np.where(counts > 0, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))

@@ -51,11 +51,11 @@ COSTS = {
 def question(
     rng: np.random.Generator, points: NDArray[np.float64], body: NDArray[np.float64]
 ) -> tuple[str, QuestionRequest]:
-    """Return a request of any query, exact or with a budget of visits, with any radius model."""
+    """Return a request of any query, exact or with a tolerance, with any radius model."""
     poses = archive_cases.near_poses(
         rng, points, body, int(rng.integers(1, 4)), 0.15, float(rng.choice([1.0, 0.5]))
     )
-    effort: dict[str, Any] = {"tolerance": 1e-3, "budget_visits": 100} if rng.random() < 0.2 else {}
+    effort: dict[str, Any] = {"tolerance": 1e-3} if rng.random() < 0.2 else {}
     if rng.random() < 0.5:
         effort["radius_model"] = str(rng.choice(MODELS))
     op = str(rng.choice(list(QUESTIONS)))

@@ -20,8 +20,6 @@ from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 
 CLEAR, CONTACT, UNKNOWN = Verdict
-# Budget of visits that is never spent: bounded searches have kernels of their own.
-PLENTY = 1 << 50
 
 
 class Asked(NamedTuple):
@@ -47,12 +45,12 @@ def _objects(a: Asked, budget: QueryBudget) -> ObjectsAnswers:
     return found
 
 
-def _collide(a: Asked, budget: QueryBudget, **more: Any) -> Any:
-    return _ask(collide_fast, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.margin)
+def _collide(a: Asked, budget: QueryBudget) -> Any:
+    return _ask(collide_fast, len(a.poses), a, budget, a.avatar, a.poses, a.margin)
 
 
-def _distance(a: Asked, budget: QueryBudget, **more: Any) -> Any:
-    return _ask(distance, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.reach)
+def _distance(a: Asked, budget: QueryBudget) -> Any:
+    return _ask(distance, len(a.poses), a, budget, a.avatar, a.poses, a.reach)
 
 
 def _near(a: Asked, budget: QueryBudget) -> Any:
@@ -69,11 +67,8 @@ def _places(a: Asked) -> NDArray[np.float64]:
 QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
     "collide": _collide,
     "collide of one pose": lambda a, e: _collide(a._replace(poses=a.poses[:1]), e),
-    "collide bounded": lambda a, e: _collide(a, e, visits=PLENTY),
-    "collide timed": lambda a, e: _collide(a, e, deadline=1e18),
     "distance": _distance,
     "distance of one pose": _near,
-    "distance bounded": lambda a, e: _distance(a, e, visits=PLENTY),
     "contacts": lambda a, e: _ask(contacts, len(a.poses), a, e, a.avatar, a.poses, 20, a.margin + 0.02),
     "sweep": lambda a, e: _ask(sweep, len(a.poses) - 1, a, e, a.avatar, a.poses[:-1], a.poses[1:], a.margin),
     "raycast": lambda a, e: _ask(raycast, len(a.poses), a, e, _places(a), a.poses[:, :3, 0].copy(), 4.0),

@@ -101,9 +101,6 @@ def query(
     budget_ms: Annotated[
         float | None, typer.Option(help="Time limit of the whole query [ms]; default: none.")
     ] = None,
-    budget_visits: Annotated[
-        int | None, typer.Option(help="Maximum number of node visits per pose; default: none.")
-    ] = None,
     radius_model: Annotated[
         str | None,
         typer.Option(
@@ -124,7 +121,7 @@ def query(
 
     Exit code 1: no answer arrived; only the error is printed. If only some answers arrived, they
     are printed, the others are unknown, and the exit code is also 1. Answers that the server itself
-    calls unknown (the budget was spent, or data in reach could not be read) are counted on standard
+    calls unknown (the time limit was reached, or data in reach could not be read) are counted on standard
     error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}

@@ -199,12 +199,11 @@ def _leaves_touch(
 
 
 @nb.njit(nogil=True, cache=True)
-def touch_bodies(a, ma, b, mb, units, origin, visits, stop, nodes, at, lanes, counters):
-    """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the search ended early.
+def touch_bodies(a, ma, b, mb, units, origin, stop, nodes, at, lanes, counters):
+    """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the stop flag ended the search.
 
-    It ends early when the visits are spent or the stop flag is set. The descent follows [Fig12]
-    figures 5 and 6, corrected as in collide_poses.py: the larger inner node is opened, a leaf never
-    is.
+    The descent follows [Fig12] figures 5 and 6, corrected as in collide_poses.py: the larger inner
+    node is opened, a leaf never is.
     nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs still to examine, and their
     placed centres.
     """
@@ -234,7 +233,7 @@ def touch_bodies(a, ma, b, mb, units, origin, visits, stop, nodes, at, lanes, co
         both = (radius_a + radius_b + reach) * (1.0 + 1e-12)
         if dx * dx + dy * dy + dz * dz > both * both:
             continue
-        if counters[0] > visits or stopped(stop):
+        if stopped(stop):
             return UNKNOWN
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
@@ -262,13 +261,13 @@ def touch_bodies(a, ma, b, mb, units, origin, visits, stop, nodes, at, lanes, co
 
 
 @nb.njit(nogil=True, cache=True)
-def touch_pairs(a, b, poses, units, pairs, margin_units, origin, visits, stop, verdict, counters):
+def touch_pairs(a, b, poses, units, pairs, margin_units, origin, stop, verdict, counters):
     """Decide whether objects pairs[:, 0] of avatar a touch objects pairs[:, 1] of avatar b.
 
     Neither avatar is empty.
     poses: (n, 4, 4), checked, of all objects.  units: (n,), see `check_poses`, without the
-    margin.  pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits
-    a pair.  stop: (1,) int64, the request's stop flag; once it is set, pairs are UNKNOWN.
+    margin.  pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  stop: (1,) int64, the request's
+    stop flag; once it is set, pairs are UNKNOWN.
     Writes verdict (p,) uint8; adds to counters (2,) int64: node visits, pairs of points tested.
     """
     nodes, at = np.empty((STACK, 2), np.int64), np.empty((STACK, 6))
@@ -284,8 +283,6 @@ def touch_pairs(a, b, poses, units, pairs, margin_units, origin, visits, stop, v
         own[0] = 0
         own[1] = 0
         reach = units[i] + units[j] + margin_units
-        verdict[number] = touch_bodies(
-            a, poses[i], b, poses[j], reach, origin, visits, stop, nodes, at, lanes, own
-        )
+        verdict[number] = touch_bodies(a, poses[i], b, poses[j], reach, origin, stop, nodes, at, lanes, own)
         counters[0] += own[0]
         counters[1] += own[1]

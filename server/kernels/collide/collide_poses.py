@@ -53,10 +53,8 @@ from ..core.scene_arrays import (
     COUNTED,
     FIRST,
     LANES,
-    MAX_RESIDENT_PATH_VISITS,
     ROW_WORDS,
     node_class,
-    should_end,
     stopped,
 )
 from ..core.voxels_in_reach import VALID, find_reach
@@ -82,13 +80,13 @@ def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_c
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = location.x, location.y, location.z
     thresholds, mask = by_class.threshold, by_class.mask
-    by_size, threshold, stop, most = mask > U(0), thresholds[0], scene.stop, counters[2]
+    by_size, threshold, stop = mask > U(0), thresholds[0], scene.stop
     early = scratch.early
     tolerant = early[1] > np.float32(0.0)
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
     depth = 1
-    while depth > 0 and not should_end(stop, counters[0], most):
+    while depth > 0 and not stopped(stop):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -176,22 +174,20 @@ def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_c
 
 
 @nb.njit(nogil=True, cache=True)
-def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, most, verdict, counts):
+def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts):
     """Answer `collide` for the poses numbered in `which`, each from its cursor on.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.
     cursor: (k,) int64, entries of `reach.lists` that are examined; a pose is finished at the end of
     its list.  state: (v,) uint8, what may be examined now, see queries/context/resolve.py.
     tolerance: exact units by which a pair may exceed the reach and still end the search, as EARLY.
-    most: node visits of a pose, beyond which its search ends.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
     tests), whose initial values are CLEAR and 0. A contact, early or not, overrides a missing voxel,
-    and a missing voxel overrides CLEAR. A pose whose search ends early, by the scene's stop flag or
-    by `most`, is not finished.
+    and a missing voxel overrides CLEAR. Once the scene's stop flag is set, poses are not
+    finished.
     """
     placed, front, scratch = make_placed(avatar), make_front(avatar), make_collide_scratch(avatar)
     by_class = make_class_thresholds(scene.radius_deficit)
-    scratch.counters[2] = most
     _collide_poses(
         poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, placed, front, by_class, scratch
     )  # fmt: skip
@@ -252,7 +248,7 @@ def _collide_poses(
                 if found != CLEAR:
                     verdict[i], at = found, end
                     break
-                if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
+                if stopped(scene.stop):
                     break
             at += 1
         cursor[i] = at
@@ -269,8 +265,8 @@ def collide_resident(pose, body, radius, other_units, tolerance, held, stop, ver
     This is `find_reach`, then `collide_poses`. Writes held.one, the voxels in reach, and verdict (1,)
     and counts (3, 1) as `collide_poses` does.
     Returns (fault, value found), as `check_poses` does, and the number of rows. -1 rows: not
-    answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
-    (scene.stop, MAX_RESIDENT_PATH_VISITS).
+    answered, because a voxel has to be loaded, the rows do not fit, or the request was
+    stopped.
     """
     avatar, scene, one, reach = body.avatar, with_flag(held.scene, stop), held.one, held.one.reach
     verdict[0], counts[0, 0], counts[1, 0], counts[2, 0] = CLEAR, np.uint32(0), np.uint32(0), np.uint32(0)
@@ -280,8 +276,7 @@ def collide_resident(pose, body, radius, other_units, tolerance, held, stop, ver
     if needed > 0:
         one.cursor[0] = 0
         collide_poses(
-            pose, avatar, scene, reach, one.which, one.cursor, held.one.all_held, tolerance, MAX_RESIDENT_PATH_VISITS, verdict,
-            counts,
+            pose, avatar, scene, reach, one.which, one.cursor, held.one.all_held, tolerance, verdict, counts,
         )  # fmt: skip
         if one.cursor[0] < needed:
             return fault, found, -1

@@ -12,7 +12,7 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK, lanes_meet, next_near, nodes_meet, sphere_is_near
 from ..core.placed_avatar import node_reach, pair_in_reach, place_block_once, place_node
-from ..core.scene_arrays import FIRST, LANES, NO_LIMIT, leaf_class, node_class, point_class, should_end
+from ..core.scene_arrays import FIRST, LANES, leaf_class, node_class, point_class, stopped
 from .early_contact import CLEAR, CONTACT, EARLY
 
 U = np.uint64  # see placed_avatar.py
@@ -24,8 +24,7 @@ class CollideScratch(NamedTuple):
     stack: (STACK, 3) int64: scene row, start of its list, length.
     below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
     keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
-    counters: (3,) int64, node visits, point tests, and the largest number of visits of a pose,
-    beyond which its search ends.
+    counters: (2,) int64, node visits, point tests.
     early: (2,) float32, see `set_early`.
     """
 
@@ -42,8 +41,7 @@ def make_collide_scratch(avatar):
     """Allocate scratch for one avatar (not empty)."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
-    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
-    counters[2] = NO_LIMIT
+    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(2, np.int64)
     return CollideScratch(
         stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters, np.empty(2, np.float32)
     )
@@ -106,7 +104,7 @@ def below_touches(avatar, m, extent, pose, placed, scene, voxel, location, a, ro
     per_step = 1.0 / scene.step
     below[0] = a
     depth = 1
-    while depth > 0 and not should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
+    while depth > 0 and not stopped(scene.stop):
         depth -= 1
         a = below[depth]
         a_first = avatar.first[a]

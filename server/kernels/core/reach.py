@@ -123,10 +123,10 @@ def all_resident(where, rows, needed):
     """Return whether a list of `needed` rows was written, and all of its voxels are resident."""
     if needed < 0 or needed > rows.shape[0]:
         return False
+    resident = True
     for at in range(needed):
-        if where[rows[at], 0] < 0:
-            return False
-    return True
+        resident &= where[rows[at], 0] >= 0
+    return resident
 
 
 @njit_inlined

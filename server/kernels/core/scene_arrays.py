@@ -53,11 +53,6 @@ COUNTED = 0xFF
 CLASS_SHIFT = 8
 LEAF_CLASS_SHIFT = 13
 LOCAL_MASK = LOCAL_CLASSES - 1
-# Largest number of node visits, for a search without a budget.
-NO_LIMIT = 1 << 62
-# Limit of node visits for a pose or a motion that is answered while the residency is locked: a few
-# milliseconds at most. A query that needs more is answered by the general path.
-MAX_RESIDENT_PATH_VISITS = 1 << 16
 # Rows copied, sorted or cleared between two checks of the stop flag: some hundred microseconds.
 ROWS_AT_ONCE = 512
 
@@ -289,15 +284,6 @@ def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
 
 # stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
 stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
-
-
-@njit_inlined
-def should_end(flag, visits, most):
-    """Return whether a search ends early.
-
-    It does once its request is stopped or it has cost more than `most` node visits.
-    """
-    return stopped(flag) or visits > most
 
 
 @nb.njit(nogil=True, cache=True)

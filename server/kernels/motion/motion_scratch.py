@@ -60,7 +60,6 @@ def make_scratch(avatar):
         np.zeros(1),
         np.zeros(1),
         np.zeros((1, 2, 3)),
-        np.zeros(1, np.int64),
         np.zeros(1),
         np.zeros(1),
     )

@@ -49,8 +49,8 @@ class MovingAvatar(NamedTuple):
     thresholds: (2, RADIUS_CLASSES) float32, of the chord by radius class: reach plus error [steps],
     and `far` (placed_avatar.py). It is one array because a sweep is passed on whole: with the four arrays of
     `ClassThresholds`, a motion of the walk took a quarter longer.
-    counters: (6,) int64, node visits, point tests, chords placed, largest number of visits,
-    orientations placed, and 1 while the chord is a translation.
+    counters: (5,) int64, node visits, point tests, chords placed, orientations placed, and 1 while
+    the chord is a translation.
     gap, displacement, keep, off, stack: scratch.
     """
 
@@ -133,7 +133,7 @@ def make_moving(avatar):
         np.zeros(6, np.int64),
         np.empty(3),
         np.empty((2, RADIUS_CLASSES), np.float32),
-        np.zeros(6, np.int64),
+        np.zeros(5, np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(LANES, np.bool_),
@@ -181,7 +181,7 @@ def _turn_nodes(avatar, pose, step, moving):
         for i in range(avatar.center.shape[0]):
             x, y, z = avatar.center[i, 0], avatar.center[i, 1], avatar.center[i, 2]
             turned[r, i] = np.float32((((m0 * x + m1 * y) + m2 * z) - root) * per_step)
-    moving.counters[4] += 1
+    moving.counters[3] += 1
 
 
 @njit_no_refcount
@@ -196,7 +196,7 @@ def _turn_block(avatar, block, moving):
             j = U(lane)
             x, y, z = points[b, 0, j], points[b, 1, j], points[b, 2, j]
             lanes[b, r, j] = np.float32((((m0 * x + m1 * y) + m2 * z) - root) * per_step)
-    moving.turned[b] = moving.counters[4]
+    moving.turned[b] = moving.counters[3]
 
 
 @njit_no_refcount
@@ -222,7 +222,7 @@ def place_nodes(avatar, speed, moving, scene):
     longest = (speed * per_step) ** 2
     count = avatar.center.shape[0]
     translation = _is_translation(begin, end)
-    moving.counters[5] = np.int64(translation)
+    moving.counters[4] = np.int64(translation)
     if translation:
         _turn_nodes(avatar, begin, scene.step, moving)
         offset[6] = _inverse(offset[3], offset[4], offset[5])
@@ -268,8 +268,8 @@ def place_block(avatar, block, moving, scene):
     """Place the points of one leaf node of the avatar at both ends of a chord."""
     per_step = 1.0 / scene.step
     lanes, displacements, points, b = moving.lanes, moving.displacements, avatar.points, U(block)
-    if moving.counters[5] != 0:
-        if moving.turned[b] != moving.counters[4]:
+    if moving.counters[4] != 0:
+        if moving.turned[b] != moving.counters[3]:
             _turn_block(avatar, block, moving)
         turned, offset = moving.turned_lanes, moving.offset
         for r in range(3):

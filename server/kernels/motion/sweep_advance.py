@@ -38,7 +38,7 @@ def advance_segments(
     for number in range(which.shape[0]):
         i = which[number]
         at, until = cursor[i], lists.starts[i + 1]
-        if progress.visits[i] < 0 or stopped(scene.stop):
+        if stopped(scene.stop):
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
@@ -49,7 +49,7 @@ def advance_segments(
                 counts[0, i] += np.uint32(1)
                 gap = min(gap, near[at] / progress.way[i] if progress.way[i] > 0.0 else 0.0)
             at += 1
-        moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
+        moving.counters[0], moving.counters[1] = 0, 0
         sweep = AvatarSweep(motion, avatar, scene, moving, np.int64(units[i]))
         size = avatar_size(box, units[i])
         lower, upper, steps = _advance(
@@ -61,7 +61,6 @@ def advance_segments(
         if upper < INFINITE and upper <= progress.upper[i]:
             _name_witness(sweep, upper, upper == progress.upper[i], progress.witness[i])
             progress.upper[i] = upper
-        progress.visits[i] -= moving.counters[0]
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
         counts[3, i] += np.uint32(steps)

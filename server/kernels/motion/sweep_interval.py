@@ -219,8 +219,8 @@ def _follows(sweep, chord, voxel, a, row):
 def _sweep_voxel(sweep, chord, voxel):
     """Update moving.first with one resident voxel by a joint descent, depth first.
 
-    Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
-    the scene's stop flag is set. A chord of length 0 continues, and skips nodes whose points all
+    Returns whether to continue: not when nothing can be earlier, or when the scene's stop flag is
+    set. A chord of length 0 continues, and skips nodes whose points all
     follow the best pair's.
     """
     avatar, scene, moving = sweep.avatar, sweep.scene, sweep.moving
@@ -242,7 +242,7 @@ def _sweep_voxel(sweep, chord, voxel):
     ):  # fmt: skip
         depth = 1
     while depth > 0:
-        if counters[0] > counters[3] or stopped(scene.stop):
+        if stopped(scene.stop):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
@@ -319,5 +319,4 @@ def search(sweep, t0, t1, rows, state):
     for row in rows:
         if state_of(state, row) == HELD and not _sweep_voxel(sweep, chord, row):
             break
-    spent = moving.counters[0] > moving.counters[3] or stopped(scene.stop)
-    return not (spent and moving.first[2] > 0.0), chord.final
+    return not (stopped(scene.stop) and moving.first[2] > 0.0), chord.final

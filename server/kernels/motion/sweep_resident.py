@@ -11,7 +11,7 @@ from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.reach import all_resident
-from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
+from ..core.scene_arrays import SceneArrays, stopped
 from ..core.voxels_in_reach import VALID, check_poses
 from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
@@ -38,7 +38,8 @@ def box_of(avatar):
 
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown_everywhere, tolerance, skin, result,
+    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown_everywhere, tolerance, skin,
+    result,
 ):  # fmt: skip
     """Sweep one motion if it is short and all voxels in its reach are resident.
 
@@ -71,7 +72,7 @@ def sweep_resident(
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
     progress.at[0], progress.end[0], progress.lower[0], progress.speed[0] = 0.0, 1.0, 1.0, 0.0
-    progress.upper[0], progress.visits[0], progress.floor[0] = np.inf, MAX_RESIDENT_PATH_VISITS, 0.0
+    progress.upper[0], progress.floor[0] = np.inf, 0.0
     for n in range(4):
         counts[n, 0] = np.uint32(0)
     needed = plan_segments(
@@ -86,7 +87,7 @@ def sweep_resident(
             box, first, last, avatar, units, from_zero, lists, one.which,
             one.cursor, held.one.all_held, tolerance, scratch, progress, counts,
         )  # fmt: skip
-        if progress.visits[0] < 0 or stopped(stop):
+        if stopped(stop):
             return _NOT_ANSWERED
         proved = progress.lower[0]
     upper = progress.upper[0]

@@ -32,7 +32,6 @@ class SweepProgress(NamedTuple):
     upper: the earliest contact found, inf: none.
     speed: upper bound of the speed of the fastest avatar point [m per unit of t].
     witness: (k, 2, 3), the pair's centres, avatar and scan, world [m].
-    visits: (k,) int64, node visits left.
     floor: fraction before which nothing absent touches, as the level of detail proves.
     way: how far the reach of the segment moves [steps], as in `VoxelLists.near`.
     """
@@ -43,7 +42,6 @@ class SweepProgress(NamedTuple):
     upper: NDArray[np.float64]
     speed: NDArray[np.float64]
     witness: NDArray[np.float64]
-    visits: NDArray[np.int64]
     floor: NDArray[np.float64]
     way: NDArray[np.float64]
 

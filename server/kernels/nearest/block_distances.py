@@ -14,27 +14,13 @@ U = np.uint64  # see placed_avatar.py
 
 
 @njit_no_refcount
-def any_near(halves, lane_at, x, y, z, far):
-    """Return whether any point of a scene block has a squared distance of at most `far` to a point.
+def write_squares(halves, lane_at, x, y, z, squares):
+    """Write the squared distances (LANES,) of a scene block's points to a point.
 
     x, y, z, and the block's points: relative to the block's low corner.
     """
     # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
     # lanes).
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    near = False
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        near |= dx * dx + dy * dy + dz * dz <= far
-    return near
-
-
-@njit_no_refcount
-def write_squares(halves, lane_at, x, y, z, squares):
-    """Write the squared distances (LANES,) of a scene block's points to a point."""
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     for lane in range(LANES):

@@ -1,7 +1,5 @@
 """Nearest pair of points so far, and the bounds by which it prunes the search.
 
-`distance` and the best-first search share this module.
-
 The nearest pair is the one with the least separation of its spheres, |a - b| - (r_a + r_b). r_a is
 the same for all pairs, and the scan point's radius is the largest radius minus the `deficit` of its
 class. The search therefore compares |a - b| + deficit. A bound on it, minus the deficit of a class,
@@ -23,7 +21,7 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, U32, make_thresholds
 from ..core.placed_avatar import lattice_to_units, place, to_units
-from ..core.scene_arrays import LANES, NO_LIMIT, point_class
+from ..core.scene_arrays import LANES, point_class
 from ..core.separation_order import compare_separations
 from .block_distances import write_squares
 
@@ -41,7 +39,8 @@ class NearestPairs(NamedTuple):
     units].
     deficit: (k,) int64, the largest radius minus the scan point's radius, exact units.
     missing_bound: (k,) float64, a lower bound of the distance of the avatar's centres from what
-    missing voxels hold [steps]; inf: nothing is missing.
+    missing voxels hold, and of |a - b| + deficit of what was not searched [steps]; inf: nothing is
+    missing, and all was searched.
     """
 
     square: NDArray[np.int64]
@@ -65,8 +64,7 @@ class BestPair(NamedTuple):
     keep8: the memory of keep as uint64, eight marks each.
     block_squares: (LANES,) float32, a square for each point of a scene block.
     units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + deficit.
-    counters: (4,) int64, node visits, point tests, candidates, and the largest number of visits of
-    a pose.
+    counters: (3,) int64, node visits, point tests, candidates.
     candidates: (MAX_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
     candidate_squares: (MAX_CANDIDATES,) float32, their least squares there.
@@ -99,7 +97,7 @@ def make_best_pair(deficit):
     return BestPair(
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), frame,
         np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
-        np.empty(2, np.int64), np.array([0, 0, 0, NO_LIMIT]), np.empty((MAX_CANDIDATES, 5), np.int64),
+        np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MAX_CANDIDATES, 5), np.int64),
         np.empty(MAX_CANDIDATES, np.float32),
     )  # fmt: skip
 
@@ -123,23 +121,6 @@ def lower_bound(words, row, x, y, z, radius):
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
     return max(apart - both, gap / words[at + U(7)] - radius) - slack
-
-
-@njit_no_refcount
-def lower_bound_with_deficit(words, row, x, y, z, radius, deficit):
-    """Return `lower_bound`, at least 0, plus the deficit. No two centres are nearer than 0."""
-    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + deficit
-
-
-@njit_no_refcount
-def upper_bound(words, row, x, y, z, radius):
-    """Return an upper bound of the distance of some sphere point from some node point.
-
-    Arguments as for `lower_bound`. The sphere and the node hold at least one point each.
-    """
-    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-    both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
-    return both + SLACK * both
 
 
 @njit_no_refcount
@@ -208,7 +189,7 @@ def _update_best(
     Ties go to the lesser scan point, then to the lesser avatar centre.
     points, shift: of Avatar and PlacedAvatar.  corner: (3,) int64, of the voxel [steps].  deficit:
     of the scan point's class.
-    The square is that of `pair_square`. Returns whether the pair is nearer.
+    The square is that of `pair_square`.
     """
     square = np.int64(0)
     units -= deficit
@@ -217,22 +198,21 @@ def _update_best(
         steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
         difference = to_units(world) - lattice_to_units(steps, units_per_step)
         if abs(difference) > units:
-            return False
+            return
         square += difference * difference
     if square > units * units:
-        return False
-    nearer = found[0] < 0
-    if not nearer:
+        return
+    lesser = found[0] < 0
+    if not lesser:
         if deficit == found[7]:
             if square > found[0]:
-                return False
-            nearer = square < found[0]
+                return
+            lesser = square < found[0]
         else:
             order = compare_separations(square, -deficit, found[0], -found[7])
             if order > 0:
-                return False
-            nearer = order < 0
-    lesser = nearer
+                return
+            lesser = order < 0
     for r in range(6):
         if r < 3:
             value = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
@@ -243,40 +223,11 @@ def _update_best(
             value = to_units(world)
         if not lesser:
             if value > found[1 + r]:
-                return False
+                return
             lesser = value < found[1 + r]
         # While all earlier values are equal, this writes the value already stored.
         found[1 + r] = value
     found[0], found[7] = square, deficit
-    return nearer
-
-
-@njit_no_refcount
-def search_lanes(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, x, y, z, frame, units, squares, found,
-    cut, far, deficit, mask,
-):  # fmt: skip
-    """Update the best pair with the pairs of one avatar point and a scene block.
-
-    x, y, z: the avatar point, float32, relative to the block's low corner. The nearest pair comes
-    first: it shrinks the cut, and few of the others then need integers.
-    c: class of the scene's leaf node.  Arguments from frame on: of `BestPair`.
-    """
-    write_squares(halves, lane_at, x, y, z, squares)
-    first = 0
-    for lane_j in range(1, LANES):
-        if squares[lane_j] < squares[first]:
-            first = lane_j
-    for number in range(-1, LANES):
-        j = first if number < 0 else number
-        if squares[j] <= far[c] and (number < 0 or j != first):
-            own = point_class(ints, block_at, j, mask)
-            nearer = squares[j] <= far[own] and _update_best(
-                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units,
-                deficit[own], found,
-            )  # fmt: skip
-            if nearer:
-                set_cut(cut, far, frame, deficit, found_units(found))
 
 
 @njit_no_refcount

@@ -16,7 +16,7 @@ from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units
 from ..core.reach import all_resident
-from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS
+from ..core.scene_arrays import stopped
 from ..core.voxels_in_reach import VALID, find_reach
 from .nearest_pair import NearestPairs
 from .nearest_search import nearest_poses
@@ -58,8 +58,8 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
     bound [m], normal, witness of the avatar, witness of the cloud, world [m]; inf and NaN where no
     pair is within reach.
     Returns (fault, value found), as `check_poses` does, then the number of rows, node visits, point
-    tests. -1 rows: not answered, because a voxel has to be loaded, the rows do not fit, or the search
-    ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
+    tests. -1 rows: not answered, because a voxel has to be loaded, the rows do not fit, or the request
+    was stopped.
     """
     avatar, scene, around = body.avatar, with_flag(held.scene, stop), held.one.reach
     fault, _, found, needed = find_reach(
@@ -75,9 +75,9 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
     if needed > 0:
         nearest_poses(
             pose, avatar, scene, around, held.one.which, cursor, held.one.all_held, reach_units, 0.0, 0.0,
-            MAX_RESIDENT_PATH_VISITS, nearest, counts,
+            nearest, counts,
         )  # fmt: skip
-        if cursor[0] < needed:
+        if stopped(stop):
             return fault, found, -1, 0, 0
     _write_result(
         nearest.square[0],

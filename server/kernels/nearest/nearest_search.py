@@ -24,6 +24,7 @@ from ..core.node_overlap import (
     BROAD,
     FLAT,
     STACK,
+    U32,
     compact_marked,
     copy_node,
     lanes_meet,
@@ -49,7 +50,6 @@ from ..core.scene_arrays import (
     ROW_WORDS,
     leaf_class,
     node_class,
-    should_end,
     stopped,
 )
 from .block_distances import nearest_squares, unmark_beyond_box
@@ -160,7 +160,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratc
     of_class = node_class(scene.ints, row, best.mask)
     below[0], keys[0] = a, np.float32(-1.0)
     depth = 1
-    while depth > 0 and not should_end(scene.stop, best.counters[0], best.counters[3]):
+    while depth > 0 and not stopped(scene.stop):
         depth -= 1
         a, within = below[depth], cut[of_class]
         if keys[depth] > within:
@@ -188,7 +188,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratc
 
 @njit_no_refcount
 def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch, best):
-    """Search one resident voxel for a nearer pair.
+    """Search one resident voxel for a nearer pair; return `_least_left`.
 
     The descent is that of collide_poses.py, and the function is long for the same reason.
     """
@@ -198,7 +198,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
     bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
     stack, mask = scratch.stack, best.mask
-    shift, frame, step, stop, most = placed.shift, placed.frame, scene.step, scene.stop, counters[3]
+    shift, frame, step, stop = placed.shift, placed.frame, scene.step, scene.stop
     location = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
     for r in range(3):
         corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
@@ -208,10 +208,10 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     broad = BROAD * radius
     if not nodes_meet(words, location[0], x, y, z, radius, cut[node_class(ints, location[0], mask)]):
-        return
+        return np.inf
     stack[0, 0], stack[0, 1], stack[0, 2] = location[0], 0, count
-    depth = 1
-    while depth > 0 and not should_end(stop, counters[0], most):
+    depth, cut_short = 1, False
+    while depth > 0 and not stopped(stop):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -243,6 +243,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
                             continue
                     elif first < 0:
                         _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratch)
+                        cut_short = stopped(stop)
                         continue
                     copy_node(bounds, which, U(i), U(left))
                     left += 1
@@ -259,6 +260,23 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
                 depth += 1
             child += ROW_WORDS
     settle_candidates(best, points, m, placed.shift, ints, scene.halves, lanes, off)
+    # The last node taken from the stack is still there, and may be searched only in part.
+    return _least_left(words, bounds, stack, depth + 1 if cut_short else depth, off, best.frame[4])
+
+
+@njit_no_refcount
+def _least_left(words, bounds, stack, entries, off, error):
+    """Return a lower bound of |a - b| of what a search left on its stack [steps]; inf: nothing.
+
+    error: of `make_thresholds`, for a shorter distance; 8 U32 cover the difference.
+    """
+    least = np.float32(np.inf)
+    for entry in range(entries):
+        row, begin, count = stack[entry, 0], stack[entry, 1], stack[entry, 2]
+        for i in range(begin, begin + count):
+            x, y, z = bounds[0, i] - off[0], bounds[1, i] - off[1], bounds[2, i] - off[2]
+            least = min(least, lower_bound(words, row, x, y, z, bounds[3, i]))
+    return max(np.float64(least) * (1.0 - 8.0 * U32) - error, 0.0)
 
 
 @njit_no_refcount
@@ -268,7 +286,8 @@ def _search_widening(
     """Search the voxels rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
-    nodes are far.
+    nodes are far. Returns a lower bound of |a - b| + deficit of what was not searched because of
+    the stop flag [steps]; inf: nothing.
     gaps: for each voxel, its `near`; inf: missing.  classes: of their largest spheres.
     """
     units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
@@ -279,6 +298,7 @@ def _search_widening(
     # Twice the radii: a distance of the size of the spheres. For spheres of radius 0, a share of
     # the reach.
     near = max(2 * (units[0] - base - beyond), (units[0] - base) >> 6, 1)
+    searched = 0.0  # no pair is nearer: the bound of the last round that was completed
     while True:
         limit = units[0]
         if found[0] >= 0:
@@ -292,25 +312,40 @@ def _search_widening(
             for other in range(last - first):
                 if 0.0 <= gaps[other] <= min(least, np.float64(cut[classes[other]])):
                     at, least = other, gaps[other]
-            if at < 0 or should_end(scene.stop, best.counters[0], best.counters[3]):
+            if at < 0:
                 break
-            gaps[at] = -1.0 - least
-            _nearest_voxel(avatar, m, pose, placed, scene, rows[first + at], front, count, scratch, best)
-        if units[1] < bound or bound == limit or should_end(scene.stop, best.counters[0], best.counters[3]):
+            left = least
+            if not stopped(scene.stop):
+                gaps[at] = -1.0 - least
+                left = _nearest_voxel(
+                    avatar, m, pose, placed, scene, rows[first + at], front, count, scratch, best
+                )
+            if left < np.inf:
+                for other in range(last - first):
+                    if gaps[other] >= 0.0:
+                        left = min(left, gaps[other])
+                # Nothing was pruned that is nearer than the pair found, or else than the bound.
+                if found[0] < 0:
+                    left = min(left, np.float64(units[1]) / best.frame[2] * (1.0 - 1e-12))
+                return max(left, searched)
+        if units[1] < bound or bound == limit:
             break
         # With a tolerance, a pair just beyond the bound may leave nothing within it worth finding.
         loose = best.frame[5] > 0.0 or best.frame[6] > 0.0
         if loose and found[0] >= 0 and units_to_beat(found_units(found), best.frame) <= bound:
             break
         near *= 4
+        # 4 units: a pair that near to the bound does not lower it (`found_units`).
+        searched = max(np.float64(bound - 4), 0.0) / best.frame[2] * (1.0 - 1e-12)
         for at in range(last - first):
             if gaps[at] < 0.0:
                 gaps[at] = -1.0 - gaps[at]
+    return np.inf
 
 
 @nb.njit(nogil=True, cache=True)
 def nearest_poses(
-    poses, avatar, scene, reach, which, cursor, state, beyond, share, tolerance, most_visits, nearest, counts
+    poses, avatar, scene, reach, which, cursor, state, beyond, share, tolerance, nearest, counts
 ):
     """Answer `distance` for the poses numbered in `which`, each from its cursor on.
 
@@ -320,11 +355,11 @@ def nearest_poses(
     share, tolerance: how much farther than the nearest pair the one found may be: this share of
     the nearest pair's |a - b|, or these exact units, whichever is more.
     Accumulates into `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests),
-    whose initial values are -1, inf and 0. Once the scene's stop flag is set, or a pose has cost more
-    than `most_visits`, a pose is not finished.
+    whose initial values are -1, inf and 0. Once the scene's stop flag is set, `missing_bound` of the
+    pose in hand bounds what was not searched, and the poses after it are not finished.
     """
     placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
-    best.counters[3], best.frame[5], best.frame[6] = most_visits, share, tolerance
+    best.frame[5], best.frame[6] = share, tolerance
     front, scratch = make_front(avatar), make_nearest_scratch()
     most = 0
     for number in range(which.shape[0]):
@@ -370,18 +405,16 @@ def _nearest_poses(
         best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        _search_widening(
+        left = _search_widening(
             poses[i], i, avatar, placed, scene, rows, beyond, first, last, front, count, scratch, best, gaps, classes
         )  # fmt: skip
-        nearest.missing_bound[i] = min(nearest.missing_bound[i], unsearched_bound(best))
+        nearest.missing_bound[i] = min(nearest.missing_bound[i], left, unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):
             nearest.pair[i, r] = best.found[1 + r]
         nearest.deficit[i] = best.found[7]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])
-        if should_end(scene.stop, best.counters[0], best.counters[3]):
-            continue
         # No voxel farther than the pair found holds a nearer pair, or one that ties.
         if last < end and best.found[0] >= 0 and near[last] * scene.units_per_step > found_units(best.found):
             last = end

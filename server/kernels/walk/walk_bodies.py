@@ -14,7 +14,7 @@ from ....schemas.kernels import compiling as nb
 from ..bodies.body_pairs import CLEAR, STACK, bound_body, find_near_bodies, touch_bodies
 from ..bodies.body_sweep import sweep_bodies
 from ..bodies.moving_bodies import BodyScratch, make_body_scratch
-from ..core.scene_arrays import LANES, NO_LIMIT
+from ..core.scene_arrays import LANES
 from .walk_state import (
     APART,
     ASKS,
@@ -183,7 +183,7 @@ def is_clear_of_bodies(walk, standing, pose):
     units, poses = standing.units + standing.units + standing.margin_units, standing.poses
     for at in range(_near_bodies(standing, walk.own, pose, pose)):
         verdict = touch_bodies(
-            avatar, pose, avatar, poses[standing.rows[at]], units, standing.origin, NO_LIMIT, walk.stop,
+            avatar, pose, avatar, poses[standing.rows[at]], units, standing.origin, walk.stop,
             standing.nodes, standing.at, standing.lanes, standing.scratch.counters,
         )  # fmt: skip
         if verdict != CLEAR:

@@ -264,8 +264,8 @@ def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
     return WalkMemory(
         arrays.tape, arrays.log, arrays.numbers, arrays.values, arrays.inputs, arrays.poses, arrays.old_plane,
-        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.used, arrays.verdict, arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values,
-        arrays.saved_poses,
+        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.used, arrays.verdict,
+        arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values, arrays.saved_poses,
     )  # fmt: skip
 
 

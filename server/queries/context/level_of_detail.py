@@ -21,6 +21,7 @@ from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.reach import VoxelLists
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...residency.voxel_cache import VoxelCache
+from ...runtime.stop_flag import StoppedError
 from ..resolve import drop_entries
 from .query_budget import QueryBudget
 from .query_context import LevelOfDetail, SceneData, check_request, make_scene_data, with_stop
@@ -95,7 +96,7 @@ def level_reach(
     """
     try:
         return check_request(data, avatar, poses, data.radius_units + beyond)
-    except (BadRequestError, TooLargeError):
+    except (BadRequestError, TooLargeError, StoppedError):
         return None
 
 

@@ -1,8 +1,8 @@
 """Budget and cost of a query, and the answer of a query that was stopped.
 
-Every query takes a `QueryBudget`. Without a limit the work ends when the answer is exact, or known
-within the tolerance. With a limit it also ends when the budget is spent; the answer is then still
-correct. See NUMERICS.md case 30.
+Every query takes a `QueryBudget`. Without a deadline the work ends when the answer is exact, or
+known within the tolerance. A deadline is a stop flag that is set at that time: the same kernels end,
+and the answer is still correct. See NUMERICS.md case 30.
 """
 
 import math
@@ -19,7 +19,6 @@ from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
 from ....schemas.wire.question_rules import Question
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
 from ...residency.voxel_cache import HeldVoxels, VoxelCache
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
 
@@ -27,9 +26,6 @@ _A = TypeVar("_A", bound=Cost)
 
 # Share of the remaining time that loads may take; the rest is for searching resident voxels.
 LOAD_SHARE = 0.5
-# Time after a budget's deadline in which searches that check the clock end by themselves, with the
-# results so far; after it the stop flag ends everything [s].
-GRACE = 0.05
 # Where a share of the distance is allowed, this is allowed at any distance: near contact a share
 # would be less than the lattice resolves [m].
 LEAST_RELATIVE = 1e-3
@@ -55,30 +51,30 @@ class QueryBudget(NamedTuple):
     [m]. The default 0 means exact.
     relative: allowed distance between the bounds of a distance, as a share of the distance between
     the centres; a millimetre is allowed at any distance if it is above 0.
-    visits: limit of node visits a pose (ray, point, motion).
-    deadline: on time.perf_counter()'s clock [s], inf for none.
+    deadline: on time.perf_counter()'s clock [s], inf for none. It sets `stop`.
     scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
     the cache (eviction.py).
     share: share of the cache for the voxels held at a time. If not all fit, work counts depend on
     it; verdicts never do.
     stop: ends the work early once it is set; what was not examined by then is unknown.
+    request: the flag of the whole request, which its deadline does not set: for its broad phase.
     late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such
     voxels are bounded (late_voxels.py), their loads are owed, and they are counted here.
     """
 
     tolerance: float = 0.0
-    visits: int = NO_LIMIT
     deadline: float = math.inf
     scan: bool = False
     share: float = 1.0
     stop: StopFlag = NO_STOP
     relative: float = 0.0
     late: LateVoxels | None = None
+    request: StopFlag = NO_STOP
 
     @property
-    def limited(self) -> bool:
-        """Return whether there is a budget. `collide` and `distance` use best-first search then."""
-        return self.visits < NO_LIMIT or self.deadline < math.inf
+    def stopped(self) -> str:
+        """Return why something else than its deadline stopped the request; "" if nothing did."""
+        return self.stop.reason or self.request.reason
 
     @property
     def between_bounds(self) -> float:
@@ -89,11 +85,6 @@ class QueryBudget(NamedTuple):
     def tolerance_units(self) -> int:
         """Return the tolerance in exact units, rounded down; at most the longest reach."""
         return math.floor(min(self.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
-
-    @property
-    def spent(self) -> bool:
-        """Return whether the time is up or the request was stopped."""
-        return bool(self.stop) or (self.deadline < math.inf and time.perf_counter() >= self.deadline)
 
     def loads_until(self) -> float:
         """Return the deadline of loads that begin now, on the same clock [s]; inf if none.
@@ -120,16 +111,13 @@ def make_budget(
     tolerance: float = 0.0,
     relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
-    budget_visits: int | None = None,
     stop: StopFlag = NO_STOP,
 ) -> QueryBudget:
     """Make the budget of a request that starts now.
 
     tolerance: [m], finite and >= 0.  relative_tolerance: finite and >= 0.
     budget_ms: time limit including waits for loads; None: no limit.
-    budget_visits: limit in node visits a pose, independent of the clock; None: no limit.
-    stop: the request's stop flag. A time budget sets it `GRACE` after its end, for kernels that do
-    not check the clock; if it is NO_STOP, the budget gets a new flag. Raise BadRequestError.
+    stop: the request's stop flag; a time limit sets a part of it. Raise BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
@@ -139,15 +127,15 @@ def make_budget(
         )
     if budget_ms is not None and not 0 <= budget_ms < math.inf:
         raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
-    if budget_visits is not None and not 0 <= budget_visits <= NO_LIMIT:
-        raise BadRequestError(f"budget_visits is {budget_visits}: expected node visits, 0 or more, or none")
-    deadline = math.inf
-    if budget_ms is not None:
-        deadline = time.perf_counter() + budget_ms / 1e3
-        stop = StopFlag() if stop is NO_STOP else stop
-        stop_at(stop, deadline + GRACE, f"the request's budget of {budget_ms:g} ms was spent")
-    visits = NO_LIMIT if budget_visits is None else int(budget_visits)
-    return QueryBudget(float(tolerance), visits, deadline, stop=stop, relative=float(relative_tolerance))
+    budget = QueryBudget(float(tolerance), stop=stop, relative=float(relative_tolerance), request=stop)
+    return budget if budget_ms is None else with_deadline(budget, time.perf_counter() + budget_ms / 1e3)
+
+
+def with_deadline(budget: QueryBudget, deadline: float) -> QueryBudget:
+    """Return the same budget with this deadline, on time.perf_counter()'s clock [s]."""
+    stop = budget.request.part()
+    stop_at(stop, deadline, "")
+    return budget._replace(deadline=deadline, stop=stop)
 
 
 class CostCounter:
@@ -211,10 +199,10 @@ def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: 
         answers = ask()
     except StoppedError:
         return unknown_answers(question, k, budget)
-    return structs.replace(answers, stopped=budget.stop.reason) if budget.stop else answers
+    return structs.replace(answers, stopped=budget.stopped) if budget.stopped else answers
 
 
 def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
     """Return `Question.unknown` for the k items of a stopped request, with the reason."""
-    answers = question.unknown(k, bounded=budget.limited or budget.tolerance > 0.0)
-    return structs.replace(answers, stopped=budget.stop.reason)
+    answers = question.unknown(k, bounded=budget.tolerance > 0.0)
+    return structs.replace(answers, stopped=budget.stopped)

@@ -152,8 +152,9 @@ def make_scene_data(archive: Archive, residency: VoxelCache, tree: VoxelTree | N
         NO_STOP.flag,
     )
     return SceneData(
-        residency, arrays, tree, archive.voxels["key"].astype(np.uint64), to_units(header.radius, "radius of the archive"),
-        header.unknown, header.unknown_everywhere, header.scan_index, SceneReferences(),
+        residency, arrays, tree, archive.voxels["key"].astype(np.uint64),
+        to_units(header.radius, "radius of the archive"), header.unknown, header.unknown_everywhere,
+        header.scan_index, SceneReferences(),
     )  # fmt: skip
 
 
@@ -174,7 +175,7 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
 
 
 def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
-    """Return the same scene for a request that only `stop` ends early."""
+    """Return the same scene for kernels that `stop` ends early."""
     return (
         data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
     )

@@ -72,14 +72,12 @@ def distance_columns(
     reach_units: int,
     nearest: NearestPairs,
     counts: NDArray[np.uint32],
-    upper: NDArray[np.float64] | None = None,
 ) -> dict[str, Any]:
     """Return the fields of `DistanceAnswers` except the cost of the request.
 
     farthest: the requested reach [m].  reach_units: the same, exact units.
     nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
     examined.
-    upper: (k,) [m], upper bounds that may be tighter than the pairs found.
     """
     radii = reach.units - reach_units  # of the largest spheres
     found = nearest.square >= 0
@@ -89,9 +87,8 @@ def distance_columns(
     floor = np.maximum(signed_bound(nearest.missing_bound, data, radii), -radii / UNITS_PER_METRE)
     # `farthest` may exceed the reach in exact units by a rounding.
     exact = floor >= np.where(found, signed, farthest)
-    upper = signed if upper is None else np.where(exact, signed, np.where(upper <= farthest, upper, np.inf))
-    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(upper, floor), farthest))
-    verdict = np.where(upper <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
+    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(signed, floor), farthest))
+    verdict = np.where(signed <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
     verdict[exact & (signed > 0)] = Verdict.CLEAR
     origin = data.arrays.origin
     difference = (nearest.pair[:, 3:] - _units_of(data, nearest.pair[:, :3])).astype(np.float64)
@@ -105,7 +102,7 @@ def distance_columns(
     for column in (normal, witness_avatar, witness_cloud):
         column[nowhere] = np.nan
     return {
-        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": upper.copy(),
+        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": signed.copy(),
         "exact": exact, "witness_avatar": witness_avatar, "witness_cloud": witness_cloud, "normal": normal,
         "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
     }  # fmt: skip

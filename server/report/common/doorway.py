@@ -67,7 +67,6 @@ def doorway_error(
     door: str = "main",
     radius_model: str | None = None,
     tolerance: float = 0.0,
-    budget_visits: int | None = None,
 ) -> Doorway:
     """Measure the doorway error of a door for the generated figure, upright and along the middle.
 
@@ -81,13 +80,7 @@ def doorway_error(
     figure = made_figure()
     radius = scene.add_avatar(avatar_name, figure).radius or 0.0
     frame = facade_truth.door(door)
-    ask = partial(
-        scene.collide,
-        avatar_name,
-        radius_model=radius_model,
-        tolerance=tolerance,
-        budget_visits=budget_visits,
-    )
+    ask = partial(scene.collide, avatar_name, radius_model=radius_model, tolerance=tolerance)
 
     def stops(poses: NDArray[np.float64], x: float) -> NDArray[np.bool_]:
         """Return which of the poses are not clear after a shift by x [m]."""

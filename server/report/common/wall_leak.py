@@ -56,15 +56,12 @@ def leak(
     *,
     radius_model: str | None = None,
     tolerance: float = 0.0,
-    budget_visits: int | None = None,
 ) -> Leak:
     """Measure the leak with a probe of 5 cm radius at every place.
 
     Adds the avatar "leak probe" to the scene. The other parameters are those of `Scene.sweep`.
     """
-    depth = leak_depths(
-        scene, walls, radius_model=radius_model, tolerance=tolerance, budget_visits=budget_visits
-    )
+    depth = leak_depths(scene, walls, radius_model=radius_model, tolerance=tolerance)
     passed = depth >= 2 * RADIUS
     p50, p99 = np.percentile(depth, [50, 99]) * 1000
     return Leak(float(p50), float(p99), float(depth.max()) * 1000, float(passed.mean()))
@@ -76,7 +73,6 @@ def leak_depths(
     *,
     radius_model: str | None = None,
     tolerance: float = 0.0,
-    budget_visits: int | None = None,
 ) -> NDArray[np.float64]:
     """Return the depths (k,) past the true surface at which the probe is stopped [m].
 
@@ -93,7 +89,6 @@ def leak_depths(
         first,
         last,
         tolerance=max(tolerance, FINEST),
-        budget_visits=budget_visits,
         radius_model=radius_model,
     )
     way = START + RADIUS

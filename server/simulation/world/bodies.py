@@ -20,7 +20,6 @@ from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...kernels.core.scene_arrays import NO_LIMIT
 from ...kernels.walk.walk_bodies import refer_to_bodies
 from ...queries.context.query_context import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
@@ -367,7 +366,7 @@ class Bodies:
             pairs = np.stack([np.zeros(len(at), np.int64), at + 1], axis=1)
             verdict = np.empty(len(at), np.uint8)
             touch_pairs(
-                shape.model.arrays, model.arrays, poses, units, pairs, margin_units, self.origin, NO_LIMIT,
+                shape.model.arrays, model.arrays, poses, units, pairs, margin_units, self.origin,
                 stop.flag, verdict, self.scratch.counters,
             )  # fmt: skip
             found[at] = verdict == CONTACT

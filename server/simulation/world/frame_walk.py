@@ -361,7 +361,7 @@ class Walker:
             each, probe = seen[0], world.probe(body.avatar)
             data, residency = each.data, each.data.residency
             alone = world.is_alone
-            native = self.native and alone and probe.is_small and not budget.limited
+            native = self.native and alone and probe.is_small
             squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
             held = data.references.to(data.arrays, data.tree)
             thread.memory.log[state.REPEATS] = 0

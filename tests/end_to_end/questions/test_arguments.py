@@ -25,11 +25,9 @@ def along(scene: Any, pose: Any, op: str) -> Any:
 # Each query, of a pose and of the end of a motion, which may have any shape that is one pose.
 ASKS: dict[str, Callable[[Any, Any, Any], Any]] = {
     "collide": lambda scene, pose, _: scene.collide("al", pose),
-    "collide with a margin": lambda scene, pose, _: scene.collide("al", pose, 0.2, budget_visits=10**6),
+    "collide with a margin": lambda scene, pose, _: scene.collide("al", pose, 0.2, budget_ms=1e9),
     "distance": lambda scene, pose, _: scene.distance("al", pose),
-    "distance bounded": lambda scene, pose, _: scene.distance(
-        "al", pose, tolerance=0.01, budget_visits=10**6
-    ),
+    "distance within a tolerance": lambda scene, pose, _: scene.distance("al", pose, tolerance=0.01),
     "contacts": lambda scene, pose, _: scene.contacts("al", pose, 5, 0.2),
     "sweep": lambda scene, pose, end: scene.sweep("al", pose, end),
     "objects": lambda scene, pose, end: scene.objects([("al", pose), ("bo", end, 2)]),

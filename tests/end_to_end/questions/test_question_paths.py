@@ -18,7 +18,7 @@ from solidcloud.server.zenoh_common.zenoh_settings import session_config
     "op, parameters",
     [
         ("collide", {}),
-        ("collide", {"margin": 0.02, "tolerance": 0.01, "budget_visits": 30}),
+        ("collide", {"margin": 0.02, "tolerance": 0.01}),
         ("distance", {"reach": 0.05}),
         ("contacts", {"limit": 3, "margin": 0.05, "cluster_distance": 0.1}),
         ("sweep", {"margin": 0.01, "tolerance": 1e-4}),
@@ -100,13 +100,6 @@ def test_parameters_that_do_not_fit_are_refused_by_both(scene, client, op, param
             list(one.path("al", POSES, op, **parameters))
 
 
-def test_a_spent_budget_is_unknown_all_along_the_path(scene, client):
-    for one in (scene, client):
-        parts = list(one.path("al", POSES, budget_visits=0))
-        verdicts = np.concatenate([part.verdict for part in parts])
-        assert len(verdicts) == len(POSES) and Verdict.CLEAR not in verdicts[~clear_at_once(parts)]
-
-
 @pytest.mark.parametrize(
     "op, parameters", [("collide", {}), ("distance", {"reach": 0.1}), ("contacts", {}), ("sweep", {})]
 )
@@ -129,10 +122,3 @@ def test_nothing_is_asked_once_the_time_is_up(scene, monkeypatch):
             len(POSES),
             len(POSES) - 1,
         }
-
-
-def clear_at_once(parts):
-    """Return which poses were clear without a visit: out of reach of every voxel."""
-    visits = np.concatenate([part.node_visits for part in parts])
-    bounds = np.concatenate([part.lower for part in parts])
-    return (visits == 0) & (bounds > 0)

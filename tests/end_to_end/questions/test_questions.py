@@ -104,7 +104,6 @@ def test_who_asks_after_warming_waits_for_no_compiler(tmp_path):
         efforts = (
             {},
             {"tolerance": 0.01},
-            {"budget_visits": 9},
             {"budget_ms": 1e4},
             {"budget_ms": 1e4, "tolerance": 0.01},
         )

@@ -15,8 +15,8 @@ def test_large_messages_in_json_are_read_in_pieces_and_are_the_same():
     poses = rng.normal(size=(k, 4, 4))
     text = encode(CollideRequest("al", poses), JSON)
     assert text == msgspec.json.encode(
-        {"avatar": "al", "poses": poses.tolist(), "margin": 0.0, "budget_ms": None, "budget_visits": None,
-         "radius_model": None, "tolerance": 0.0}
+        {"avatar": "al", "poses": poses.tolist(), "margin": 0.0, "budget_ms": None, "radius_model": None,
+         "tolerance": 0.0}
     )  # fmt: skip
     text = text.replace(b"]", b" ] ").replace(b"[", b" [ ")
     found = decode_request(CollideRequest, text, JSON)

@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.requests import (
 POSES = np.tile(np.eye(4), (3, 1, 1))
 VECTORS = np.arange(9.0).reshape(3, 3)
 REQUESTS = [
-    CollideRequest("al", POSES, 0.5, tolerance=0.1, budget_ms=2.5, budget_visits=7),
+    CollideRequest("al", POSES, 0.5, tolerance=0.1, budget_ms=2.5),
     DistanceRequest("al", POSES, 0.5),
     ContactsRequest("al", POSES, 5, 0.25, 0.125),
     SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES + 1, margin=0.5),
@@ -68,7 +68,7 @@ def test_no_request_holds_what_is_not_finite(request_, encoding):
 
 
 BAD = {
-    "tolerance": (-1e-9, np.inf, np.nan), "budget_ms": (-1.0, np.inf), "budget_visits": (-1, 2**63),
+    "tolerance": (-1e-9, np.inf, np.nan), "budget_ms": (-1.0, np.inf),
     "margin": (-1.0, np.nan), "reach": (-1.0, np.inf), "avatar": ("", "a" * 65), "limit": (-1, 10_001),
     "cluster_distance": (-1.0,), "op": ("raycast", "hop"),
 }  # fmt: skip
@@ -102,9 +102,9 @@ def test_fields_that_are_not_known_are_refused(request_):
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
 def test_numbers_of_numpys_are_numbers(encoding):
-    given = {"limit": np.int64(5), "margin": np.float32(0.25), "budget_visits": np.uint32(7)}
+    given = {"limit": np.int64(5), "margin": np.float32(0.25), "budget_ms": np.uint32(7)}
     got = decode_request(ContactsRequest, encode(ContactsRequest("al", POSES, **given), encoding), encoding)
-    assert (got.limit, got.margin, got.budget_visits) == (5, 0.25, 7)
+    assert (got.limit, got.margin, got.budget_ms) == (5, 0.25, 7)
     with pytest.raises(BadRequestError, match=r"limit is 2\.5"):
         ContactsRequest("al", POSES, 2.5)
 

@@ -32,10 +32,12 @@ def both(built: Built) -> Iterator[Scene]:
         yield scene
 
 
-def test_time_that_is_up_leaves_nothing_clear(both: Scene, built: Built, rng: np.random.Generator) -> None:
+def test_time_that_is_up_says_nothing_wrong(both: Scene, built: Built, rng: np.random.Generator) -> None:
     poses = near(rng, np.vstack(built.points), 10)
     exact = both.collide("al", poses)
-    assert both.collide("al", poses, budget_ms=0.0).verdict.tolist() == [2] * 10
+    late = both.collide("al", poses, budget_ms=0.0).verdict
+    known = late != 2  # by the level of detail
+    assert (late[known] == exact.verdict[known]).all()
     found = both.collide("al", poses, budget_ms=60_000.0)
     assert found.verdict.tolist() == exact.verdict.tolist()
     assert set(both.sweep("al", poses, np.roll(poses, 1, axis=0), budget_ms=0.0).verdict.tolist()) <= {1, 2}
@@ -48,9 +50,8 @@ def test_time_that_is_up_leaves_nothing_clear(both: Scene, built: Built, rng: np
         ("distance", {"reach": 0.2}),
         ("contacts", {"limit": 1, "margin": 0.05}),
         ("sweep", {}),
-        ("collide", {"budget_visits": 60, "tolerance": 1e-4}),
-        ("sweep", {"budget_visits": 100_000}),
-        ("distance", {"reach": 0.2, "budget_visits": 40, "budget_ms": 60_000.0}),
+        ("collide", {"tolerance": 1e-4}),
+        ("distance", {"reach": 0.2, "budget_ms": 60_000.0}),
     ],
 )
 def test_a_path_answers_as_its_question(
@@ -61,17 +62,14 @@ def test_a_path_answers_as_its_question(
         rng, np.vstack([built.points[0], transform_points(pose, built.points[1])]), 90 if COUNT > 20 else 8
     )
     with several((built.first, None), (built.second, pose)) as scene:
-        # With a deadline a question is looked at in slices, so what a budget of visits leaves may differ: not the bits.
-        options = {name: value for name, value in parameters.items() if name != "budget_ms"}
         what = [poses[:-1], poses[1:]] if op == "sweep" else [poses]
-        expected = getattr(scene, op)("al", *what, **options)
+        expected = getattr(scene, op)("al", *what, **parameters)
         for threads in (1, 2):
             parts = list(scene.path("al", poses, op, threads=threads, **parameters))
             assert [part.first for part in parts] == np.cumsum([0, *(len(p) for p in parts)])[:-1].tolist()
             assert {part.total for part in parts} == {len(expected)}
             found = np.concatenate([part.verdict for part in parts])
-            if "budget_ms" not in parameters:
-                assert found.tolist() == expected.verdict.tolist()
+            assert found.tolist() == expected.verdict.tolist()
             if op == "contacts":
                 counts = np.concatenate([np.diff(part.pair_starts) for part in parts])
                 assert counts.tolist() == np.diff(expected.pair_starts).tolist()
@@ -171,9 +169,9 @@ def test_what_is_refused_says_why(built: Built, both: Scene) -> None:
     with pytest.raises(BadRequestError, match="this archive stores mean"):
         both.collide("al", here, radius_model="local")
     with pytest.raises(BadRequestError, match="1 poses to begin at and 2 to end at"):
-        both.sweep("al", here, np.repeat(here, 2, axis=0), budget_visits=5)
+        both.sweep("al", here, np.repeat(here, 2, axis=0))
     with pytest.raises(BadRequestError, match="2 origins and 1 directions"):
-        both.raycast(np.zeros((2, 3)), np.ones((1, 3)), 1.0, budget_visits=5)
+        both.raycast(np.zeros((2, 3)), np.ones((1, 3)), 1.0)
     with pytest.raises(BadTransformError, match="pose 1 mirrors"):
         both.collide("al", np.array([np.eye(4), np.diag([-1.0, 1, 1, 1])]))
     with pytest.raises(BadRequestError, match="direction 0 is zero"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_frames import flip_a_byte
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import QueryBudget
+from solidcloud.server.queries.context.query_budget import make_budget
 from solidcloud.server.queries.distance_per_scan import ScanSeparations, separation_per_scan
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
@@ -53,8 +53,7 @@ def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
         assert separation_per_scan(case.data, make_avatar(np.empty((0, 3))), POSE, 0.1, 2) == ScanSeparations(
             {}, True
         )
-        assert not separation_per_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(visits=1)).exact
-        late = separation_per_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(deadline=0.0))
+        late = separation_per_scan(case.data, BALL, POSE, 0.1, 2, make_budget(budget_ms=0))
         assert late == ScanSeparations({}, False)
         lost = case.data._replace(unknown_everywhere=True)
         assert not separation_per_scan(lost, BALL, POSE, 0.1, 2).exact

@@ -84,7 +84,6 @@ def test_a_load_says_what_the_index_said(places: tuple[Path, np.ndarray, np.ndar
 QUESTIONS: dict[str, Callable[[Scene, np.ndarray], Any]] = {
     "collide": lambda scene, at: scene.collide("ball", poses_at(at)),
     "collide, one by one": lambda scene, at: [scene.collide("ball", pose[None]) for pose in poses_at(at)],
-    "collide, bounded": lambda scene, at: scene.collide("ball", poses_at(at), budget_visits=1 << 30),
     "distance": lambda scene, at: scene.distance("ball", poses_at(at), 0.001),
     "contacts": lambda scene, at: scene.contacts("ball", poses_at(at)),
     "sweep": lambda scene, at: scene.sweep("ball", poses_at(at), poses_at(at + 1e-4)),

@@ -1,6 +1,5 @@
 """`objects`: budgets, groups, and what is refused."""
 
-import time
 from collections.abc import Iterator
 
 import archive_cases
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import QueryBudget
+from solidcloud.server.queries.context.query_budget import make_budget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.residency.voxel_cache import VoxelCache
@@ -52,12 +51,14 @@ def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
 
 
 def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
-    late = QueryBudget(deadline=time.perf_counter() - 1)
-    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], budget=late)
-    assert answers.verdict.tolist() == [CLEAR, UNKNOWN, CLEAR]
+    late = make_budget(budget_ms=0)
+    poses = at(0, 0.5, 9)
+    poses[2, :3, 3] = synthetic_scans.make_scan("plane", 1, 50)[0]
+    answers = objects(data, [BALL] * 3, poses, [1] * 3, [1, 1 | SCENE_GROUP, SCENE_GROUP], budget=late)
+    assert answers.verdict.tolist() == [CLEAR, CLEAR, UNKNOWN], "the second is out of all reach"
     assert answers.pairs.tolist() == [[0, 1]] and answers.pair_verdict.tolist() == [UNKNOWN]
     assert answers.pairs_tested == 0 and answers.misses == 0
-    soon = QueryBudget(deadline=time.perf_counter() + 600)
+    soon = make_budget(budget_ms=600_000)
     answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, budget=soon)
     assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
 

@@ -16,7 +16,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.queries.context.query_budget import QueryBudget
+from solidcloud.server.queries.context.query_budget import make_budget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
@@ -146,7 +146,7 @@ def test_where_all_is_unknown_only_hits_are_said(tmp_path: Path) -> None:
 
 def test_a_deadline_that_has_passed_leaves_all_unknown_and_loads_nothing(noise: Path) -> None:
     with opened(noise) as data:
-        late = QueryBudget(deadline=time.perf_counter() - 1)
+        late = make_budget(budget_ms=0)
         rays, near = raycast(data, [(-1.0, 1, 1)], [X], 9, late), within(data, [(1.0, 1, 1)], 9, late)
         for answers in (rays, near):
             assert answers.verdict.tolist() == [UNKNOWN] and answers.lower.tolist() == [0]
@@ -163,7 +163,7 @@ def test_what_is_loaded_too_late_is_unknown(beads: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(VoxelStore, "load", slow)
     with opened(beads) as data:
         origins = [(x, -1.0, 0.0) for x in (0.0, 1.0, 2.0, 3.0)]
-        answers = raycast(data, origins, [Y] * 4, 5, QueryBudget(deadline=time.perf_counter() + 0.2))
+        answers = raycast(data, origins, [Y] * 4, 5, make_budget(budget_ms=200))
         late = answers.verdict == UNKNOWN
         assert late.sum() >= 3 and (answers.verdict[~late] == CONTACT).all() and answers.exact[~late].all()
         assert (answers.lower[late] <= 0.99).all() and not answers.exact[late].any() and answers.resident <= 1

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
+from solidcloud.server.queries.context.query_budget import EXACT, make_budget
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.queries.sweep import sweep
@@ -81,7 +81,7 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         long[:, :3, 3] += [60.0, 0, 0]
         probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
         same(probe, data, first, long)
-        spent = QueryBudget(visits=0)
+        spent = make_budget(budget_ms=0)
         assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
         unseen = data._replace(unknown_everywhere=True)
         for seen in (unseen, data._replace(unknown=np.array([[[-(10**6)] * 3, [10**6] * 3]]))):

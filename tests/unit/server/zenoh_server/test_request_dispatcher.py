@@ -88,10 +88,9 @@ def test_every_operation_answers_in_both_encodings(service, encoding):
 
 EFFORT = {
     "budget_ms": 20.0,
-    "budget_visits": 7,
     "radius_model": "local:0.5",
 }
-PLAIN = {"budget_ms": None, "budget_visits": None, "radius_model": None}
+PLAIN = {"budget_ms": None, "radius_model": None}
 TOLERANT = EFFORT | {"tolerance": 0.5}
 LOOSE = TOLERANT | {"relative_tolerance": 0.25}
 POSES = np.tile(np.eye(4), (3, 1, 1))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 from solidcloud.schemas.errors import BusyError, CorruptError
-from solidcloud.schemas.wire.warming_parts import BUDGETS, PARTS
+from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.zenoh_server.warming import Warming
 
 REST = list(PARTS[1:])
@@ -40,10 +40,8 @@ def test_what_is_not_ready_is_refused_with_its_reason():
     warming.run_first()
     assert warming.compiling == REST
     warming.check("collide")
-    with pytest.raises(BusyError, match=r"^distance not ready: this server compiles .* 8 of 9 .* again"):
+    with pytest.raises(BusyError, match=r"^distance not ready: this server compiles .* 7 of 8 .* again"):
         warming.check("distance")
-    with pytest.raises(BusyError, match="budgets not ready"):
-        warming.check("collide", BUDGETS)
     assert warming.run_rest() and warming.compiling == []
     warming.check(*PARTS)
 

@@ -101,14 +101,14 @@ class Asked:
         square = naive.least_square(one, other)
         self.least = math.isqrt(square - 1) + 1 if square else 0
 
-    def ask(self, reach: int, visits: int = 1 << 40, turned: bool = False) -> tuple[int, int, int]:
+    def ask(self, reach: int, turned: bool = False) -> tuple[int, int, int]:
         """The verdict, node visits and pairs of points tested, with radii and margin adding up to `reach` units."""
         units = np.array([reach // 2, reach // 3])
         verdict, counters = np.full(1, 9, np.uint8), np.array([100, 200])
         a, b, pair = (self.b, self.a, [1, 0]) if turned else (self.a, self.b, [0, 1])
         kernel.touch_pairs(
             a.arrays, b.arrays, self.poses, units, np.array([pair]), reach - int(units.sum()),
-            ORIGIN, visits, NO_STOP.flag, verdict, counters,
+            ORIGIN, NO_STOP.flag, verdict, counters,
         )  # fmt: skip
         return int(verdict[0]), int(counters[0]) - 100, int(counters[1]) - 200
 
@@ -174,7 +174,7 @@ def test_pairs_after_the_stop_are_unknown_and_not_examined() -> None:
     for expected in (kernel.CLEAR, kernel.UNKNOWN):
         verdict, counters = np.full(len(pairs), 99, np.uint8), np.zeros(2, np.int64)
         kernel.touch_pairs(
-            model.arrays, model.arrays, poses, np.full(n, 2**23), pairs, 0, ORIGIN, 1 << 40, stop.flag,
+            model.arrays, model.arrays, poses, np.full(n, 2**23), pairs, 0, ORIGIN, stop.flag,
             verdict, counters,
         )  # fmt: skip
         assert (verdict == expected).all()

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core.reach import FAN, Items, VoxelLists, VoxelTree, list_reach, make_voxel_tree
+from solidcloud.server.kernels.core.reach import (
+    FAN,
+    Items,
+    VoxelLists,
+    VoxelTree,
+    list_reach,
+    make_voxel_tree,
+)
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 pytestmark = pytest.mark.interpreted
@@ -72,7 +79,9 @@ def test_lists_hold_what_is_reached_nearest_first(moves: bool, count: int) -> No
     lists = listed(tree_of(low, high, unknown), items)
     for i, (start, end, wide, own) in enumerate(zip(*items, strict=True)):
         if moves:
-            near, hidden = (entered(start, end, wide, *both) for both in ((low, high), unknown.swapaxes(0, 1)))
+            near, hidden = (
+                entered(start, end, wide, *both) for both in ((low, high), unknown.swapaxes(0, 1))
+            )
         else:
             near, hidden = (apart(start, wide, own, *both) for both in ((low, high), unknown.swapaxes(0, 1)))
         rows = lists.rows[lists.starts[i] : lists.starts[i + 1]]

@@ -1,4 +1,4 @@
-"""Voxels in memory: cache, arena and allocator, eviction, prefetch and level of detail.
+"""Voxels in memory: the cache, its arena, eviction, prefetch and the level of detail.
 
 May import server.kernels, server.runtime, schemas.
 Begin with voxel_cache.py.

@@ -27,16 +27,16 @@ from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
 from .placed_archive import PlacedArchive
 from .rigid_transform import Pose
-from .scene_info import count_sources
 
 _A = TypeVar("_A", bound=Cost)
 # Range of rows of a request; None: all rows.
 Rows = slice | None
 # Function that queries one archive for some rows of a request.
 AskRows = Callable[[SceneData, QueryBudget, Rows], _A]
-# The same function, and whether its voxels are used in passing (`QueryBudget.scan`).
-PreparedQuery = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
-PrepareQuery = Callable[[PlacedArchive, ArchiveGeneration], PreparedQuery]
+# Items of a request in the frame of one archive, column by column, and whether the voxels near them
+# are used in passing (`QueryBudget.scan`).
+PlacedItems = tuple[Sequence[Any], bool]
+PlaceItems = Callable[[PlacedArchive, ArchiveGeneration], PlacedItems]
 # Pairs that `contacts` lists per pose by default.
 DEFAULT_LIMIT = 100
 
@@ -59,7 +59,8 @@ def ask_each(
     archives: Sequence[PlacedArchive],
     question: Question[_A],
     k: int,
-    prepare: PrepareQuery,
+    place: PlaceItems,
+    engine: Callable[[SceneData, QueryBudget, Sequence[Any]], _A],
     tolerance: float = 0.0,
     relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
@@ -69,32 +70,38 @@ def ask_each(
 ) -> _A:
     """Query every archive for k items (poses, rays, points, motions or objects); merge the answers.
 
-    prepare: returns, for an archive and its current generation, the function that queries it.
+    place: returns the items for an archive and its current generation.  engine: queries an archive.
     tolerance, relative_tolerance, budget_ms, budget_visits, stop: as for `make_budget`.
     radius_model: see schemas/archive/radius_model.py; None: that of each archive.
     Raise BadRequestError, and the errors of the query.
     """
     budget = make_budget(tolerance, relative_tolerance, budget_ms, budget_visits, stop)
-    if len(archives) == 1 and archives[0].pose is None:
-        with archives[0].take() as opened:
-            data = opened.data if radius_model is None else opened.radius_model(radius_model)
-            ask, scan = prepare(archives[0], opened)
-            own = budget._replace(scan=True) if scan else budget
-            return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.stop), own, None))
     visits = np.zeros(k, np.int64)
     answers: list[_A] = []
     first = 0
     for archive in archives:
         with archive.take() as opened:
             data = with_stop(opened.radius_model(radius_model), budget.stop)
-            ask, scan = prepare(archive, opened)
+            items, scan = place(archive, opened)
             own = budget._replace(scan=scan)
+            ask = partial(_ask_rows, engine, items)
             found = ask_until_stopped(question, k, own, partial(ask_within_budget, ask, data, own, visits))
             answers.append(answers_in_world(found, archive.pose, first))
-            first += count_sources(opened)
+            first += opened.sources
         if budget.visits < NO_LIMIT:
             visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
     return merge_answers(answers)
+
+
+def _ask_rows(
+    engine: Callable[[SceneData, QueryBudget, Sequence[Any]], _A],
+    items: Sequence[Any],
+    data: SceneData,
+    budget: QueryBudget,
+    rows: Rows,
+) -> _A:
+    """Query an archive for some rows of the items."""
+    return engine(data, budget, items if rows is None else [column[rows] for column in items])
 
 
 def ask_within_budget(
@@ -129,16 +136,11 @@ def make_legs(
 
     taken: the current generation of each archive, in the order of `archives`.
     """
-    firsts = [0, *np.cumsum([count_sources(opened) for opened in taken]).tolist()]
+    firsts = [0, *np.cumsum([opened.sources for opened in taken]).tolist()]
     return [
         PathLeg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
         for opened, archive, first in zip(taken, archives, firsts, strict=False)
     ]
-
-
-def rows_of(column: Any, rows: Rows) -> Any:
-    """Return some rows of an argument; the argument itself if `rows` is None."""
-    return column if rows is None else column[rows]
 
 
 def ask_along(

@@ -1,7 +1,7 @@
 """Answers of `info` and `stats`: of an archive, from its header alone, and of a scene of several."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
@@ -19,8 +19,10 @@ from ...schemas.wire.scene_messages import (
 from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
 from ..observability.request_stats import RequestStats, times_of
 from ..residency.voxel_store import VoxelStore
-from .archive_generation import ArchiveGeneration
 from .rigid_transform import Pose, transform_boxes, transform_poses
+
+if TYPE_CHECKING:
+    from .archive_generation import ArchiveGeneration  # loads all queries; `info` needs none
 
 
 def describe(store: VoxelStore, name: str) -> SceneInfo:
@@ -146,7 +148,7 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
 
 def make_stats(
     name: str,
-    each: Sequence[ArchiveGeneration],
+    each: Sequence["ArchiveGeneration"],
     metrics: RequestStats,
     avatars: AvatarStats,
     *,
@@ -187,7 +189,7 @@ def make_stats(
     )
 
 
-def _resident_keys(opened: ArchiveGeneration) -> list[int]:
+def _resident_keys(opened: "ArchiveGeneration") -> list[int]:
     """Return the keys of an archive's resident voxels."""
     rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
     keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()

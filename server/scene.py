@@ -11,17 +11,18 @@ from typing import Any
 from msgspec import structs
 from numpy.typing import ArrayLike
 
-from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.errors import BadRequestError, CorruptError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
 from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, checked_late
+from ..schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ..schemas.wire.requests import AddAvatarRequest, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
+from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..schemas.wire.warming_parts import MOTION, PARTS
-from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
-from .archives.scene_info import join_infos, make_stats
+from .archives.scene_info import describe_scene, join_infos, make_stats
 from .avatars.avatar_model import describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import check_owner
@@ -32,6 +33,7 @@ from .residency.voxel_store import OpenStore, VoxelStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
 from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, list_avatars
+from .scenes.residency_watch import ResidencyWatch
 from .scenes.scene_archives import (
     ReadPoints,
     error_location,
@@ -41,14 +43,16 @@ from .scenes.scene_archives import (
     read_avatars,
 )
 from .scenes.scene_questions import SceneQuestions
-from .scenes.scene_tiles import SceneTiles
 from .simulation.local_session import LocalSession
 from .simulation.simulation import Simulation, make_simulation
+from .tiles.scene_overview import read_overview
+from .tiles.voxel_list import list_voxels
+from .tiles.voxel_tile import read_tile
 
 DEFAULT_BUDGET = 512 << 20
 
 
-class Scene(SceneTiles, SceneQuestions):
+class Scene(SceneQuestions):
     """One or more placed archives, queried as one. Thread-safe; a context manager.
 
     name: name of the scene for clients. Until `reload`, answers are those of the archives' content
@@ -115,7 +119,7 @@ class Scene(SceneTiles, SceneQuestions):
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
             return cls._open_file(path, name, budget_bytes, policy, read_points, level_bytes)
         metrics = RequestStats()
-        archive = PlacedArchive.open(
+        archive = PlacedArchive(
             path,
             name,
             budget_bytes=budget_bytes,
@@ -251,6 +255,47 @@ class Scene(SceneTiles, SceneQuestions):
             found = make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
         effects = [] if self._simulation is None else self._simulation.effect_stats()
         return structs.replace(found, effects=effects)
+
+    def overview(self, limit: int = 100_000) -> OverviewAnswer:
+        """Return a sample of the points of all archives; see `OverviewAnswer`.
+
+        It is that of the archives' previews: how long it takes does not depend on the number of
+        points.
+        """
+        request = OverviewRequest(limit)
+        with ExitStack() as stack:
+            opened = [stack.enter_context(archive.take()).store for archive in self.archives]
+            return read_overview(request, self.archives, opened)
+
+    def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
+        """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`."""
+        request = voxels_request(place, reach, limit)
+        with ExitStack() as stack:
+            opened = [stack.enter_context(archive.take()) for archive in self.archives]
+            return list_voxels(request, self.archives, opened)
+
+    def residency_changes(self) -> ResidencyWatch:
+        """Return the changes of what is resident from now on, for a `with`; see `ResidencyChanges`."""
+        return ResidencyWatch(self.archives)
+
+    def tile(
+        self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None
+    ) -> TileAnswer:
+        """Return points or spheres of a voxel; see `TileRequest`. Raise BadRequestError, CorruptError.
+
+        The record is read from the archive's file, and not added to the voxels in memory.
+        """
+        request = tile_request(archive, voxel, detail, level)
+        if request.archive >= len(self.archives):
+            raise BadRequestError(f"archive {archive}: expected below {len(self.archives)}")
+        placed = self.archives[request.archive]
+        with placed.take() as opened:
+            try:
+                return read_tile(request, placed, opened.store, opened.level_archive)
+            except OSError as error:
+                raise CorruptError(
+                    f"voxel {request.voxel}: cannot be read ({error}): check the disk"
+                ) from error
 
     def limit_avatars(self, limits: AvatarLimits) -> None:
         """Limit the memory of clients' avatars from now on; existing ones stay."""

@@ -64,12 +64,12 @@ ALLOWED = {
     ),
     "server/scenes": (
         "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "
-        "simulation/effects tiles"
+        "simulation/effects"
     ),
     "server/pictures": "avatars archives",
     "server/scene.py": (
         "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes "
-        "pictures"
+        "pictures tiles"
     ),
     "server/report/common": "cli/input cli/output avatars residency scene.py",
     "server/cli/input": "scene_interface.py",

@@ -157,6 +157,15 @@ class Header:
     classification: bool = False
 
     @property
+    def listed_sources(self) -> int:
+        """Return the number of sources that an archive lists: those up to the last one that was built.
+
+        A source that was left out before it keeps its row, because a point's `scan_index` is a row
+        of the list.
+        """
+        return max((number for number, s in enumerate(self.sources, 1) if not s.fault), default=0)
+
+    @property
     def radius_class(self) -> bool:
         """Return True if the points have a radius class, or the cover class of a level."""
         return self.models != ("mean",) or self.is_level

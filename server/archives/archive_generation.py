@@ -46,6 +46,7 @@ class ArchiveGeneration:
     radius_model: function that returns the scene data with the radius model of a name; None: the
     default. It raises BadRequestError for an invalid model, or one that the archive does not store.
     Only readers may use `data` and `radius_model`.
+    sources: number of the sources that the archive lists; those of the next archive follow.
     kept: data that other modules store with this generation, by module name.
     number: counts the generations of this archive, from 0.
     ended: event that is set when the last reader has left and everything is closed.
@@ -78,6 +79,7 @@ class ArchiveGeneration:
                 "restore it"
             )
         self.store, self.number = store, number
+        self.sources = store.archive.header.listed_sources
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
         self._lock = threading.Lock()

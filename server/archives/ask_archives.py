@@ -25,12 +25,12 @@ from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
 from .placed_archive import PlacedArchive
 from .rigid_transform import Pose
-from .scene_info import count_sources
 
 _A = TypeVar("_A", bound=Cost)
-# Function that queries one archive, and whether its voxels are used in passing (`QueryBudget.scan`).
-PreparedQuery = tuple[Callable[[SceneData, QueryBudget], Any], bool]
-PrepareQuery = Callable[[PlacedArchive, ArchiveGeneration], PreparedQuery]
+# Items of a request in the frame of one archive, column by column, and whether the voxels near them
+# are used in passing (`QueryBudget.scan`).
+PlacedItems = tuple[Sequence[Any], bool]
+PlaceItems = Callable[[PlacedArchive, ArchiveGeneration], PlacedItems]
 # Pairs that `contacts` lists per pose by default.
 DEFAULT_LIMIT = 100
 
@@ -53,7 +53,8 @@ def ask_each(
     archives: Sequence[PlacedArchive],
     question: Question[_A],
     k: int,
-    prepare: PrepareQuery,
+    place: PlaceItems,
+    engine: Callable[[SceneData, QueryBudget, Sequence[Any]], _A],
     tolerance: float = 0.0,
     relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
@@ -62,28 +63,22 @@ def ask_each(
 ) -> _A:
     """Query every archive for k items (poses, rays, points, motions or objects); merge the answers.
 
-    prepare: returns, for an archive and its current generation, the function that queries it.
+    place: returns the items for an archive and its current generation.  engine: queries an archive.
     tolerance, relative_tolerance, budget_ms, stop: as for `make_budget`.
     radius_model: see schemas/archive/radius_model.py; None: that of each archive.
     Raise BadRequestError, and the errors of the query.
     """
     budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
-    if len(archives) == 1 and archives[0].pose is None:
-        with archives[0].take() as opened:
-            data = opened.data if radius_model is None else opened.radius_model(radius_model)
-            ask, scan = prepare(archives[0], opened)
-            own = budget._replace(scan=True) if scan else budget
-            return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.request), own))
     answers: list[_A] = []
     first = 0
     for archive in archives:
         with archive.take() as opened:
             data = with_stop(opened.radius_model(radius_model), budget.request)
-            ask, scan = prepare(archive, opened)
+            items, scan = place(archive, opened)
             own = budget._replace(scan=scan)
-            found = ask_until_stopped(question, k, own, partial(ask, data, own))
+            found = ask_until_stopped(question, k, own, partial(engine, data, own, items))
             answers.append(answers_in_world(found, archive.pose, first))
-            first += count_sources(opened)
+            first += opened.sources
     return merge_answers(answers)
 
 
@@ -97,7 +92,7 @@ def make_legs(
 
     taken: the current generation of each archive, in the order of `archives`.
     """
-    firsts = [0, *np.cumsum([count_sources(opened) for opened in taken]).tolist()]
+    firsts = [0, *np.cumsum([opened.sources for opened in taken]).tolist()]
     return [
         PathLeg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
         for opened, archive, first in zip(taken, archives, firsts, strict=False)

@@ -13,6 +13,7 @@ answered from the generation that it began with.
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ from ..queries.raycast import make_directions
 from ..residency.voxel_cache import VoxelCache
 from ..residency.voxel_store import OpenStore, VoxelStore
 from .archive_generation import ArchiveGeneration
-from .archive_info import describe
 from .rigid_transform import archive_pose, inverse_pose, rotate_vectors, transform_points, transform_poses
+from .scene_info import describe
 
 _Floats = NDArray[np.float64]
 
@@ -43,40 +44,6 @@ class PlacedArchive:
 
     def __init__(
         self,
-        store: VoxelStore,
-        name: str,
-        budget_bytes: int,
-        policy: str = "lru",
-        open_store: OpenStore = VoxelStore,
-        radius_model: str | None = None,
-        pose: ArrayLike | None = None,
-        took: Callable[[float], None] | None = None,
-        level_bytes: int | None = None,
-    ) -> None:
-        """Serve the voxels of `store`; callers use `PlacedArchive.open`.
-
-        name: of the scene, for messages.  open_store: opens the folder at each reload.
-        pose: (4, 4), archive to world; None: the identity.
-        took: called with the duration of each voxel load [s].
-        level_bytes: see `ArchiveGeneration`.
-        Raise BadRequestError or BadTransformError for a pose that is not rigid.
-        """
-        self.name, self._folder, self._open_store = name, store.archive.folder, open_store
-        self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
-        self._took, self._level_bytes = took, level_bytes
-        self.pose = archive_pose(pose)
-        self.inverse = None if self.pose is None else inverse_pose(self.pose)
-        self._opened = self._open(store, 0)
-        # Generation replaced by the last reload; some requests may still read it.
-        self._before: ArchiveGeneration | None = None
-        self._info = describe(store, name)
-        self._closed = False
-        self._lock = threading.Lock()
-        self._reloading = threading.Lock()
-
-    @classmethod
-    def open(
-        cls,
         folder: str | Path,
         name: str | None = None,
         *,
@@ -87,27 +54,44 @@ class PlacedArchive:
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
         level_bytes: int | None = None,
-    ) -> "PlacedArchive":
-        """Open the archive in `folder`; see `Scene.open`."""
-        store = open_store(folder)
+    ) -> None:
+        """Open the archive in `folder`; see `Scene.open`.
+
+        name: of the scene, for messages; None: that of the folder.
+        open_store: opens the folder, now and at each reload.
+        pose: (4, 4), archive to world; None: the identity.
+        took: called with the duration of each voxel load [s].
+        level_bytes: see `ArchiveGeneration`.
+        Raise BadRequestError or BadTransformError for a pose that is not rigid.
+        """
+        self.name = name or Path(folder).resolve().name
+        self.pose = archive_pose(pose)
+        self.inverse = None if self.pose is None else inverse_pose(self.pose)
+        self._folder, self._open_store = Path(folder), open_store
+        self._make_generation = partial(
+            ArchiveGeneration,
+            budget_bytes=budget_bytes,
+            policy=policy,
+            took=took,
+            radius_model=radius_model,
+            level_bytes=level_bytes,
+        )
+        self._opened = self._open(0)
+        # Generation replaced by the last reload; some requests may still read it.
+        self._before: ArchiveGeneration | None = None
+        self._info = describe(self._opened.store, self.name)
+        self._closed = False
+        self._lock = threading.Lock()
+        self._reloading = threading.Lock()
+
+    def _open(self, number: int) -> ArchiveGeneration:
+        """Open the folder as it is now."""
+        store = self._open_store(self._folder)
         try:
-            name = name or Path(folder).resolve().name
-            return cls(store, name, budget_bytes, policy, open_store, radius_model, pose, took, level_bytes)
+            return self._make_generation(store, number=number)
         except BaseException:
             store.close()
             raise
-
-    def _open(self, store: VoxelStore, number: int) -> ArchiveGeneration:
-        """Open a generation of `store` with this archive's budget, policy and radius model."""
-        return ArchiveGeneration(
-            store,
-            self._budget_bytes,
-            self._policy,
-            number,
-            self._took,
-            self._radius_model,
-            self._level_bytes,
-        )
 
     def take(self) -> ArchiveGeneration:
         """Return the current generation with one more reader, for a `with`.
@@ -148,25 +132,20 @@ class PlacedArchive:
                 raise BusyError(
                     f"{self.name}: the previous generation is still in use, perhaps by a path: reload later"
                 )
-            store = self._open_store(self._folder)
-            try:
-                new = self._open(store, old.number + 1)
-            except BaseException:
-                store.close()
-                raise
+            new = self._open(old.number + 1)
             try:
                 new.warm()
                 new.load_voxels_of(old, lambda: self._closed)
                 with self._lock:
                     if self._closed:
                         raise BadRequestError(f"{self.name}: closed while it was reloaded: open it again")
-                    info = describe(store, self.name)
+                    info = describe(new.store, self.name)
                     self._opened, self._before, self._info = new, old, info
             except BaseException:
                 new.release()
                 raise
             old.release()
-        before, now = old.store.archive.header, store.archive.header
+        before, now = old.store.archive.header, new.store.archive.header
         return ReloadAnswer(
             self.name, before.generation, now.generation, now.points, time.perf_counter() - begin
         )

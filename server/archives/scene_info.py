@@ -1,17 +1,97 @@
-"""Answers of `info` and `stats` for a scene of several archives."""
+"""Answers of `info` and `stats`: of an archive, from its header alone, and of a scene of several."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
 
-from ...schemas.wire.scene_messages import SceneInfo
+from ...schemas.scene.effect_table import ORDER, effect_name
+from ...schemas.scene.scene_file import SceneFile, up_of
+from ...schemas.wire.scene_messages import (
+    WIRE_VERSION,
+    AvatarInfo,
+    ObjectInfo,
+    SceneInfo,
+    SourceInfo,
+    SpawnInfo,
+)
 from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
 from ..observability.request_stats import RequestStats, times_of
-from .archive_generation import ArchiveGeneration
-from .archive_info import listed_sources
+from ..residency.voxel_store import VoxelStore
 from .rigid_transform import Pose, transform_boxes, transform_poses
+
+if TYPE_CHECKING:
+    from .archive_generation import ArchiveGeneration  # loads all queries; `info` needs none
+
+
+def describe(store: VoxelStore, name: str) -> SceneInfo:
+    """Return the description of an archive: counts, bounds [m], lattice, radius [m] and sources.
+
+    name: of the scene. Positions are in the archive's own frame.
+    """
+    header = store.archive.header
+    lattice, now = header.lattice, header.radius_now
+    return SceneInfo(
+        scene=name,
+        format_version=header.format_version,
+        wire_version=WIRE_VERSION,
+        points=header.points,
+        voxels=len(store.sizes),
+        bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
+        origin=list(lattice.origin),
+        lattice_step=lattice.step,
+        lattice_source=header.lattice_source,
+        voxel_size=lattice.voxel_size,
+        radius=header.radius,
+        radius_model=header.radius_model,
+        radius_models=list(header.models),
+        radius_error=header.radius_error,
+        radius_sample=header.radius_sample,
+        moved_max=header.moved_max,
+        degree=header.degree,
+        leaf=header.leaf,
+        sources=[
+            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
+            for s in header.sources[: header.listed_sources]
+        ],
+        skipped=[s.fault for s in header.sources if s.fault],
+        record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
+        resident_bytes=int(store.sizes.sum()),
+        unknown=[lattice.to_world(box).tolist() for box in header.unknown],
+        unknown_everywhere=header.unknown_everywhere,
+        generation=header.generation,
+        radius_now=now.radius if now else None,
+        radius_now_error=now.error if now else None,
+    )
+
+
+def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:
+    """Return a description with the declarations of the scene file: effects, avatars, up, objects.
+
+    info: of the archives.  avatars: those that the scene file names.
+    """
+    spawn = file.spawn
+    return structs.replace(
+        info,
+        effects=run_order(file),
+        avatars=list(avatars),
+        up=up_of(file),
+        spawn=None if spawn is None else SpawnInfo(spawn.position, spawn.heading),
+        objects=[ObjectInfo(item.name, item.avatar, item.pose, item.kind) for item in file.objects],
+        default_radius_model=file.radius_model,
+    )
+
+
+def run_order(file: SceneFile) -> list[str]:
+    """Return the names of a scene's effects in the order in which they run.
+
+    `through` comes first, because it acts when the archive is opened.
+    """
+    declared = {effect_name(effect) for effect in file.effects}
+    if len(declared) < 2:
+        return list(declared)
+    return [name for name in ("through", *ORDER) if name in declared]
 
 
 def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
@@ -60,14 +140,6 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
     )
 
 
-def count_sources(opened: ArchiveGeneration) -> int:
-    """Return the number of sources that a generation lists; those of the next archive follow."""
-    count = opened.kept.get("sources")
-    if count is None:
-        count = opened.kept["sources"] = listed_sources(opened.store.archive.header)
-    return int(count)
-
-
 def _box(box: list[list[float]], pose: Pose | None) -> Any:
     """Return a box (2, 3), or the box that encloses it after transformation by a pose."""
     sides = np.array(box)
@@ -76,7 +148,7 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
 
 def make_stats(
     name: str,
-    each: Sequence[ArchiveGeneration],
+    each: Sequence["ArchiveGeneration"],
     metrics: RequestStats,
     avatars: AvatarStats,
     *,
@@ -117,7 +189,7 @@ def make_stats(
     )
 
 
-def _resident_keys(opened: ArchiveGeneration) -> list[int]:
+def _resident_keys(opened: "ArchiveGeneration") -> list[int]:
     """Return the keys of an archive's resident voxels."""
     rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
     keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()

@@ -2,6 +2,6 @@
 
 May import server.archives, server.avatars, server.kernels, server.observability, server.queries,
 server.queries.context, server.residency, server.runtime, server/scene_interface.py,
-server.simulation.effects, server.tiles, schemas.
+server.simulation.effects, schemas.
 Begin with scene_questions.py.
 """

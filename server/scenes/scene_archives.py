@@ -20,8 +20,8 @@ from ...schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
 from ...schemas.scene.scene_file import SUFFIX, SceneFile
 from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
-from ..archives.archive_info import describe
 from ..archives.placed_archive import PlacedArchive
+from ..archives.scene_info import describe
 from ..avatars.avatar_model import describe_avatar, make_avatar
 from ..avatars.avatar_shape import avatar_shape
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
@@ -169,7 +169,7 @@ def open_archives(
     with ExitStack() as stack:
         for number, (each, budget, item) in enumerate(zip(found, budgets, file.archives, strict=True)):
             with error_location(path, f"$.archives[{number}]"):
-                archive = PlacedArchive.open(
+                archive = PlacedArchive(
                     each.folder,
                     name,
                     budget_bytes=budget,

@@ -16,7 +16,7 @@ from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.question_rules import Question
 from ...schemas.wire.requests import make_objects, make_vectors
 from ..archives.archive_generation import ArchiveGeneration
-from ..archives.ask_archives import PathParts, PreparedQuery, ask_along, ask_each, make_legs
+from ..archives.ask_archives import PathParts, PlacedItems, PlaceItems, ask_along, ask_each, make_legs
 from ..archives.merge_answers import limit_pairs
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
@@ -112,94 +112,48 @@ class SceneQuestions(QueryMethods):
     def _ask_placed(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Answer `ask` for archives that are several or not at the identity."""
+        """Answer `ask` for archives that are several or not at the identity, each in its own frame."""
+        user, first = ("", ""), 0
+        subject: tuple[AvatarModel, ...] = ()
         if question.whole:
-            return self._ask_objects(question, given, client, options)
-        if not question.about_avatars:
-            return self._ask_vectors(question, given, options)
-        answers: Any = self._ask_avatar(question, given, client, options)
+            user, what = (client, ""), given[1:]
+            k, place = self._place_objects(given[0], client)
+        else:
+            if question.about_avatars:
+                user, subject, first = (client, given[0]), (self.avatar(given[0], client),), 1
+            end = first + len(question.arrays)
+            around = 0.0 if question.around is None else given[question.around]
+            k, place = _place_arrays(question, given[first:end], user, subject, around)
+            what = given[end:]
+
+        def ask(data: SceneData, budget: QueryBudget, items: Sequence[Any]) -> _A:
+            found: _A = ENGINES[question.name](data, *subject, *items, *what, budget=budget)
+            return found
+
+        answers: Any = ask_each(self.archives, question, k, place, ask, **options)
+        self._metrics.answered(*user, answers)
         if question.listed is not None and len(self.archives) > 1:
             answers = limit_pairs(answers, given[question.arguments.index(question.listed[0])])
         return answers  # type: ignore[no-any-return]
 
-    def _ask_avatar(
-        self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
-    ) -> _A:
-        """Answer a question about an avatar in each archive's own frame."""
-        count, name, engine = len(question.arrays), given[0], ENGINES[question.name]
-        avatar, arrays, what = self.avatar(name, client), given[1 : 1 + count], given[1 + count :]
-        arrays = tuple(make_poses(each) for each in arrays)
-        if len(arrays[0]) != len(arrays[-1]):
-            raise BadRequestError(
-                f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected equal numbers"
-            )
+    def _place_objects(self, objects: Any, client: str) -> tuple[int, PlaceItems]:
+        """Return the number of objects, and the function that places them in an archive's frame.
 
-        around = 0.0 if question.around is None else given[question.around]
-
-        def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> PreparedQuery:
-            own = [archive.poses_in(each) for each in arrays]
-
-            def ask(data: SceneData, budget: QueryBudget) -> _A:
-                answers: _A = engine(data, avatar, *own, *what, budget=budget)
-                return answers
-
-            return ask, opened.record_user((client, name), avatar, own[-1], around)
-
-        answers = ask_each(self.archives, question, len(arrays[0]), prepare, **options)
-        self._metrics.answered(client, name, answers)
-        return answers
-
-    def _ask_vectors(self, question: Question[_A], given: tuple[Any, ...], options: dict[str, Any]) -> _A:
-        """Answer a question about points or rays, (k, 3) arrays, in each archive's own frame."""
-        engine, names = ENGINES[question.name], tuple(question.arrays)
-        arrays, what = given[: len(names)], given[len(names) :]
-        arrays = tuple(make_vectors(each, name) for each, name in zip(arrays, names, strict=True))
-        if len(arrays[0]) != len(arrays[-1]):
-            raise BadRequestError(
-                f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected equal numbers"
-            )
-
-        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
-            own = [
-                archive.directions_in(each) if name in question.directions else archive.points_in(each)
-                for each, name in zip(arrays, names, strict=True)
-            ]
-
-            def ask(data: SceneData, budget: QueryBudget) -> _A:
-                answers: _A = engine(data, *own, *what, budget=budget)
-                return answers
-
-            return ask, False
-
-        answers = ask_each(self.archives, question, len(arrays[0]), prepare, **options)
-        self._metrics.answered("", "", answers)
-        return answers
-
-    def _ask_objects(
-        self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
-    ) -> _A:
-        """Answer `objects`. Pairs of objects are tested in the frame of the first archive only."""
-        engine, what = ENGINES[question.name], given[1:]
-        items, poses = make_objects(given[0])
+        Pairs of objects are tested in the frame of the first archive only. For other archives, their
+        groups are 0: they are tested against the scene only.
+        """
+        items, poses = make_objects(objects)
         avatars = [self.avatar(item.avatar, client) for item in items]
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
 
-        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
-            # For other archives, groups are 0: objects are tested against the scene only.
-            first = archive is self.archives[0]
-            own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
-            mask = masks if first else masks & np.uint32(SCENE_GROUP)
+        def place(archive: PlacedArchive, _: ArchiveGeneration) -> PlacedItems:
+            own = archive.poses_in(poses)
+            if archive is self.archives[0]:
+                return (avatars, own, groups, masks), False
+            return (avatars, own, groups & np.uint32(0), masks & np.uint32(SCENE_GROUP)), False
 
-            def ask(data: SceneData, budget: QueryBudget) -> _A:
-                answers: _A = engine(data, avatars, own, group, mask, *what, budget=budget)
-                return answers
-
-            return ask, False
-
-        answers = ask_each(self.archives, question, len(items), prepare, **options)
-        self._metrics.answered(client, "", answers)
-        return answers
+        return len(items), place
 
     def path(
         self,
@@ -248,6 +202,39 @@ class SceneQuestions(QueryMethods):
             for opened in taken:
                 opened.release()
             raise
+
+
+def _place_arrays(
+    question: Question[Any],
+    given: Sequence[Any],
+    user: tuple[str, str],
+    subject: tuple[AvatarModel, ...],
+    around: float,
+) -> tuple[int, PlaceItems]:
+    """Return the number of items, and the function that places them in an archive's frame.
+
+    given: the arrays of the request.  user: client and name of the avatar, `subject` the avatar
+    itself, if the question is about one.  around: its margin or reach [m].
+    """
+    names = tuple(question.arrays)
+    arrays = [
+        make_poses(each) if subject else make_vectors(each, name)
+        for each, name in zip(given, names, strict=True)
+    ]
+    if len(arrays[0]) != len(arrays[-1]):
+        one, other = ("poses to begin at", "to end at") if subject else (names[0], names[-1])
+        raise BadRequestError(f"{len(arrays[0])} {one} and {len(arrays[-1])} {other}: expected equal numbers")
+
+    def place(archive: PlacedArchive, opened: ArchiveGeneration) -> PlacedItems:
+        if subject:
+            own = [archive.poses_in(each) for each in arrays]
+            return own, opened.record_user(user, subject[0], own[-1], around)
+        return [
+            archive.directions_in(each) if name in question.directions else archive.points_in(each)
+            for each, name in zip(arrays, names, strict=True)
+        ], False
+
+    return len(arrays[0]), place
 
 
 def _terms(

@@ -81,7 +81,7 @@ def read_tile(
             cells, unit = transpose_columns(tree.cells), top_shift(lattice.voxel_steps)
             places, radii = _spheres(nodes, cells, tree.links, request.level, unit)
         corner = np.array(request.voxel, np.int64) * lattice.voxel_steps
-        reach = radii * lattice.step if len(radii) else 0.0
+        reach = np.float64(lattice.step) * radii if len(radii) else 0.0
         shown = ~store.hides(lattice.to_world(places + corner), reach)
         places, radii = places[shown], radii[shown[: len(radii)]]
         # Half a unit is what rounding a centre may move it.

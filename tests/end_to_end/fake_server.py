@@ -36,10 +36,10 @@ from solidcloud.schemas.wire.scene_messages import (
 )
 from solidcloud.schemas.wire.stats import StatsAnswer
 from solidcloud.schemas.wire.warming_parts import MOTION
-from solidcloud.server.archives.archive_info import describe_scene
+from solidcloud.server.archives.scene_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import AvatarShape, record_avatar
-from solidcloud.server.scenes.scene_tiles import SceneTiles
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
 from solidcloud.server.simulation.simulation import Simulation
@@ -92,11 +92,18 @@ def floor_simulation(name="floor", users=64, **fields):
     return scene.simulation
 
 
-class FloorScene(SceneTiles):
+class FloorScene:
     """The scene methods that a service calls.
 
     Avatars named "crash" raise, those named "wait" wait for `gate`.
     """
+
+    overview, voxels, tile, residency_changes = (
+        Scene.overview,
+        Scene.voxels,
+        Scene.tile,
+        Scene.residency_changes,
+    )
 
     def __init__(self, name="floor", delay=0.0):
         self.name, self.delay = name, delay

@@ -12,7 +12,7 @@ from kept_archives import build_or_copy
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
-from solidcloud.server.archives.archive_info import describe
+from solidcloud.server.archives.scene_info import describe
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget

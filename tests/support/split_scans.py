@@ -68,9 +68,7 @@ class Built:
 def several(*archives: tuple[Path, Any], **options: Any) -> Scene:
     """Open a scene of archives at poses, with an avatar."""
     metrics, how = RequestStats(), {"budget_bytes": DEFAULT_BUDGET, **options}
-    opened = [
-        PlacedArchive.open(path, "hall", pose=pose, took=metrics.loaded, **how) for path, pose in archives
-    ]
+    opened = [PlacedArchive(path, "hall", pose=pose, took=metrics.loaded, **how) for path, pose in archives]
     scene = Scene(opened, "hall", metrics)
     scene.add_avatar("al", BODY, RADIUS)
     return scene

@@ -10,9 +10,9 @@ import numpy as np
 
 from ....schemas.scene.effect_table import Objects, Through, Uncertainty, effect_name
 from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_name, up_of
-from ...archives.archive_info import run_order
 from ...archives.masked_store import MaskedStore
 from ...archives.rigid_transform import transform_boxes
+from ...archives.scene_info import run_order
 from ...scenes.scene_archives import (
     FoundArchive,
     FoundAvatar,

@@ -18,7 +18,7 @@ from ....schemas.process.new_file import new_file
 from ....schemas.process.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, SceneFile, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
-from ...archives.archive_info import describe
+from ...archives.scene_info import describe
 from ...residency.voxel_store import VoxelStore
 from ...scene import DEFAULT_BUDGET, Scene
 from ...scene_interface import AvatarShape

@@ -17,7 +17,7 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 
     from .....builder.passes.archive_summary import summarize_archive
     from .....schemas.archive.radius_model import radius_distribution
-    from ....archives.archive_info import describe
+    from ....archives.scene_info import describe
     from ....residency.voxel_store import VoxelStore
     from ...output.archive_facts import archive_details, detail_facts, print_summary
     from ...output.console import print_info

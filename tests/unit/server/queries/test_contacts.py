@@ -15,7 +15,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.request_limits import MAX_CONTACTS
-from solidcloud.server.archives.archive_info import describe
+from solidcloud.server.archives.scene_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts

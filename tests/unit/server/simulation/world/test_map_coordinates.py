@@ -38,7 +38,7 @@ def walk(archive: Path, shift: Floats, ways: Floats) -> tuple[Floats, int]:
     """
     pose = np.eye(4)
     pose[:3, 3] = shift
-    placed = PlacedArchive.open(archive, budget_bytes=1 << 28, pose=pose)
+    placed = PlacedArchive(archive, budget_bytes=1 << 28, pose=pose)
     items = [ArchiveItem(path=str(archive), pose=pose.tolist())]
     with Scene([placed], "map") as scene:
         world, swept = Counted(scene, SceneFile(format=1, archives=items, effects=EFFECTS)), []

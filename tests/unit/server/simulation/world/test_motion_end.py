@@ -37,7 +37,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
 def test_motions_end_where_clear_poses_are_found_step_by_step(
     room: archive_cases.Case, rng: np.random.Generator, skin: float
 ) -> None:
-    placed = PlacedArchive.open(room.archive, budget_bytes=1 << 28)
+    placed = PlacedArchive(room.archive, budget_bytes=1 << 28)
     effects: list[AnyEffect] = [Stop(skin=skin), Sweep(tolerance=1e-6)]
     file = SceneFile(format=1, archives=[ArchiveItem(path=str(room.archive))], effects=effects)
     person, hits, proved = effect_rooms.person(), 0, 0

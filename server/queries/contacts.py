@@ -110,7 +110,7 @@ def contacts_steps(
     reach = check_request(data, avatar, array, data.radius_units + margin_units)
     k = len(array)
     tally = ContactResults(np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros((k, 4), np.int64))
-    memory, finished, level = _empty_memory(limit), np.ones(k, bool), find_level(data, budget)
+    memory, finished, level = empty_memory(limit), np.ones(k, bool), find_level(data, budget)
     options = ContactOptions(
         avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS
     )  # fmt: skip
@@ -167,7 +167,7 @@ def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) 
     return np.asarray(np.maximum(steps, 1.0).astype(np.int64))
 
 
-def _empty_memory(limit: int) -> ContactState:
+def empty_memory(limit: int) -> ContactState:
     """Return the memory of a search that has not begun."""
     return ContactState(
         make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),

@@ -7,12 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.contacts.contact_cells import BY_SCAN, CELLS, DEFICIT, PLACE, SQUARE, ContactOptions
+from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.reach import VoxelLists
-from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
 from .collide import clear_of_rows
+from .contacts import MAX_CELLS, empty_memory
 from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
+from .context.signed_distance import signed_from_square
 from .resolve import Steps, drop_items, resolve, run
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.
@@ -46,9 +49,7 @@ def separation_per_scan(
     Scans farther than `margin` [m] are omitted.
     data: of an archive that keeps the scan of each point.  scans: their number.
     The pairs are those that `contacts` finds with this margin, and the separation of a scan is that
-    of its deepest pair, except for the last bits: if the separations of several pairs differ only
-    by rounding, it is that of one of them. A point whose number belongs to no scan counts as
-    ANY_SCAN.
+    of its deepest pair. A point whose number belongs to no scan counts as ANY_SCAN.
     budget: a deadline may leave pairs out; `exact` is then false.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
@@ -59,14 +60,14 @@ def separation_per_scan(
     reach = check_request(data, avatar, poses, units)
     if not len(avatar.points):
         return ScanSeparations({}, True)
-    nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
-    counts, lists, level = np.zeros(3, np.int64), reach.lists, find_level(data, budget)
+    tally = ContactResults(np.zeros((3, 1), np.int64), np.zeros(1, np.int64), np.zeros((1, 4), np.int64))
+    options = ContactOptions(avatar.rows, np.full(1, BY_SCAN), True, 0, MAX_CELLS)
+    memory, level, arrays = empty_memory(0), find_level(data, budget), with_stop(data, budget.stop).arrays
 
-    arrays = with_stop(data, budget.stop).arrays
-
-    def search(lists: VoxelLists, _: NDArray[np.int64], *state: NDArray[Any]) -> None:
+    def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
+        nonlocal memory
         own = reach._replace(lists=lists)
-        nearest_by_scan(poses, avatar.arrays, arrays, own, *state, margin_units, nearer, counts)
+        memory = gather_contacts(poses, avatar.arrays, arrays, own, *state, options, memory, tally)
 
     def settle(lists: VoxelLists) -> Steps[VoxelLists]:
         if level is None or not lists.starts[-1]:
@@ -75,9 +76,14 @@ def separation_per_scan(
         clear = yield from clear_of_rows(level, avatar, poses, margin_units, rows, budget, spent)
         return drop_items(lists, clear)
 
-    left = run(resolve(data, lists, search, budget, spent, settle))
-    exact = left[0] == np.inf and counts[0] == 0
+    left = run(resolve(data, reach.lists, search, budget, spent, settle))
+    missing, visits, tests = tally.counts[:, 0].tolist()
+    exact = left[0] == np.inf and missing == 0
     exact &= not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
-    found = np.flatnonzero(nearer.gaps < np.inf).tolist()
-    separations = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
-    return ScanSeparations(separations, bool(exact), int(counts[1]), int(counts[2]))
+    cells = memory.cells.table[: memory.sizes[CELLS]]
+    gaps = signed_from_square(cells[:, SQUARE], reach.units[0] - margin_units - cells[:, DEFICIT])
+    separations: dict[int, float] = {}
+    for number, gap in zip(cells[:, PLACE].tolist(), gaps.tolist(), strict=True):
+        number = number if number < scans else ANY_SCAN
+        separations[number] = min(gap, separations.get(number, np.inf))
+    return ScanSeparations(separations, bool(exact), visits, tests)

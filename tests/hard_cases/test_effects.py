@@ -65,7 +65,6 @@ MOVING = {"sweep", "slide", "ground", "step", "crowd"}
 # What only some effects have a use for, and which.
 HELPERS = {
     "server.queries.distance_per_scan": {"uncertainty"},
-    "server.kernels.nearest.nearest_by_scan": {"uncertainty"},
     "server.archives.masked_store": {"through"},
     "server.simulation.world.bodies": {"objects", "crowd"},
     "server.simulation.world.body_obstacles": {"objects", "crowd"},

@@ -26,6 +26,8 @@ SQUARE, DEFICIT, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9
 # A cluster is the record of its deepest pair, then the number of its pairs and the box of its
 # touched points. A cell is the same, followed by its place in the grid.
 PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
+# Edge of cells of which each holds the points of one scan. Only the deepest pair of each counts then.
+BY_SCAN = 0
 # Counters of `ContactState.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell
 # used, depth of the stack, and the pose whose pairs these are (-1: none).
 CELLS, KEPT, LISTED, CLUSTERS, LAST, DEPTH, POSE = range(7)
@@ -68,7 +70,7 @@ class ContactOptions(NamedTuple):
     """Parameters of a request, in addition to the poses.
 
     rows: (b, LANES) int32, the row of the avatar's point in each lane.
-    edges: (k,) int64, edge of a cell [steps].
+    edges: (k,) int64, edge of a cell [steps]; BY_SCAN: a cell holds the points of one scan instead.
     with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
     cells: limit of the table of cells, a power of two.
@@ -261,12 +263,14 @@ def enter_cell(cells, used, x, y, z):
 
 @njit_no_refcount
 def cell_of(cells, sizes, record, edge):
-    """Return the row of the cell of the record's scan point.
+    """Return the row of the cell of the record's scan point, or of its scan.
 
     There must be a free row for a new cell.
     """
     table, last = cells.table, sizes[LAST]
     x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
+    if edge == BY_SCAN:
+        x, y, z, edge = record[0, SCAN], 0, 0, 1
     if last >= 0:  # nearly always the last cell, and divisions are slow
         x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
         if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:

@@ -39,6 +39,7 @@ from ..core.scene_arrays import (
     stopped,
 )
 from .contact_cells import (
+    BY_SCAN,
     CELLS,
     DEPTH,
     KEPT,
@@ -48,9 +49,11 @@ from .contact_cells import (
     SCAN,
     ContactScratch,
     ContactState,
+    find_slot,
     gather_point,
     grow_cells,
     listing_bound,
+    square_below,
 )
 from .contact_clusters import list_pose
 
@@ -67,6 +70,21 @@ class ContactResults(NamedTuple):
     counts: NDArray[np.int64]
     pairs: NDArray[np.int64]
     runs: NDArray[np.int64]
+
+
+@njit_no_refcount
+def _bound_of_scans(halves, at, count, cells):
+    """Return the largest bound, as in `ContactCells`, of the scans of some points; inf: one has no pair.
+
+    halves, at: the scan numbers of `count` points.
+    """
+    widest, last = -1.0, np.int64(-1)
+    for j in range(count):
+        scan = np.int64(halves[U(at + j)])
+        if scan != last:
+            row, last = cells.slots[find_slot(cells, scan, 0, 0)], scan
+            widest = max(widest, cells.bound[row] if row >= 0 else np.inf)
+    return widest
 
 
 @njit_no_refcount
@@ -87,9 +105,16 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
     )
     fars, mask = scratch.by_class.far, scratch.by_class.mask
     threshold = scratch.by_class.threshold[node_class(ints, row, mask)]
+    scene_block = ~ints[row + FIRST]
+    scan_at = np.int64(0)
+    if options.with_scan:
+        scan_at = scan_run(scene.where, voxel, scene.block_words) + scene_block * LANES
+    if edge == BY_SCAN:
+        # A wall that one scan saw costs only its nodes and the scan numbers of its points.
+        widest = _bound_of_scans(halves, scan_at, ints[row + COUNT] & COUNTED, state.cells)
+        threshold = np.float32(min(np.float64(threshold), widest * (1.0 + 1e-6)))
     if not lanes_meet(words, row, lanes, block, off[0], off[1], off[2], threshold, keep):
         return
-    scene_block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
     at_x = U(lane_at)
@@ -110,7 +135,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         avatar_lanes[1, j] = lanes[block, 1, j] - ly
         avatar_lanes[2, j] = lanes[block, 2, j] - lz
     record, squares = scratch.record, scratch.squares
-    coordinates, where, counts, pairs = scene.coordinates, scene.where, results.counts, results.pairs
+    coordinates, counts, pairs = scene.coordinates, results.counts, results.pairs
     for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
@@ -120,6 +145,12 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         counts[2, i] += LANES
         own = point_class(ints, block_at, j, mask)
         far = fars[own]
+        if edge == BY_SCAN:
+            bound = _bound_of_scans(halves, scan_at + j, 1, state.cells)
+            if bound < np.inf:
+                far = min(
+                    far, square_below(bound, np.float64(scene.radius_deficit[own]) / scene.units_per_step)
+                )
         touched = False
         for lane in range(LANES):
             dx, dy, dz = x - avatar_lanes[0, lane], y - avatar_lanes[1, lane], z - avatar_lanes[2, lane]
@@ -132,7 +163,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
             record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
         record[0, SCAN] = -1
         if options.with_scan:
-            record[0, SCAN] = halves[scan_run(where, voxel, scene.block_words) + scene_block * LANES + j]
+            record[0, SCAN] = halves[scan_at + j]
         pairs[i] += gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch)
 
 
@@ -215,7 +246,7 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.  cursor: as in
     `collide_poses`.  held: states of voxels.
-    A finished pose is listed. The call returns before a voxel that is not held; when the scene's stop
+    A finished pose is listed; by scan, its cells are left in the state. The call returns before a voxel that is not held; when the scene's stop
     flag is set; and if the table of cells has reached `options.cells` and has no space for LANES more.
     Call again with the returned state, from the same pose on. Adds to `results`.
     """
@@ -258,5 +289,6 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
             _gather_voxel(avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results)
             if state.sizes[DEPTH] == 0:
                 cursor[i] += 1
-        state = list_pose(state, results.runs[i], scene.stop)
+        if options.edges[i] != BY_SCAN:
+            state = list_pose(state, results.runs[i], scene.stop)
     return state

@@ -60,14 +60,13 @@ def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
 
 
 @pytest.mark.interpreted
-def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp_path: Path) -> None:
+def test_trees_of_several_levels_give_the_gaps_of_all_pairs(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform(0, 1, (120, 3)) * [1, 1, 0.05]
     avatar = make_avatar(rng.uniform(-0.3, 0.3, (90, 3)) * [1, 1, 0.1], 0.02)
     case = contact_cases.open_case(
         tmp_path, points, rng, scan_count=3, voxel=0.5, leaf=8, cell_points=20, degree=3
     )
-    visits, tests = [], []
     with closing(case.store):
         for height in (0.02, 0.13, 0.3):
             pose = archive_cases.pose_of(archive_cases.random_rotation(rng), np.array([0.5, 0.5, height]))
@@ -78,9 +77,6 @@ def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp
             assert found.separations == pytest.approx(
                 {s: g for s, g in expected.items() if g <= 0.05}, abs=2e-4
             )
-            visits.append(found.node_visits)
-            tests.append(found.point_tests)
-    assert visits == [105, 111, 73] and tests == [1664, 2336, 1088]
 
 
 @pytest.mark.interpreted

@@ -49,11 +49,13 @@ def default_folder(cache: str) -> Path:
 class KernelFiles:
     """Folder of compiled kernels. Threads may share an instance; processes may share the folder.
 
-    folder: where the files are; created on first use.
+    folder: where the files are; created on first use.  delivered: a folder with more of them, which
+    is only read; it need not exist.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, delivered: Path | None = None) -> None:
         self.folder = folder
+        self._delivered = delivered
         self._warned: set[str] = set()
         self._pruned = False
         self.has_waited = False  # whether another process was found compiling
@@ -73,11 +75,12 @@ class KernelFiles:
         Without a file, wait while another process compiles it; the first process is to write it.
         """
         if self._descriptor is None:
-            return None
+            return self._read_delivered(name)
         try:
             content = self._content(name)
         except FileNotFoundError:
-            return self.read(name) if self._claim(name) else None
+            payload = self._read_delivered(name)
+            return self.read(name) if payload is None and self._claim(name) else payload
         except OSError as error:
             self.discard(name, error.strerror or str(error))
             return None
@@ -86,6 +89,15 @@ class KernelFiles:
             self.discard(name, f"its {len(content)} bytes do not match their digest")
             return None
         return payload
+
+    def _read_delivered(self, name: str) -> bytes | None:
+        """Return a payload of the delivered kernels; None if there is none that may be used."""
+        if self._delivered is not None:
+            with contextlib.suppress(OSError):
+                content = (self._delivered / name).read_bytes()
+                if content[:_HEAD] == _head(name, content[_HEAD:]):
+                    return content[_HEAD:]
+        return None
 
     def write(self, name: str, payload: bytes) -> None:
         """Write a payload under `name`, atomically."""
@@ -109,8 +121,10 @@ class KernelFiles:
             self._release(name)
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove a damaged file, and log that on the first occurrence."""
+        """Remove a damaged file, and log that on the first occurrence; not without a fault."""
         removed = self._remove(name)
+        if not fault:
+            return
         outcome = "removed" if removed else "it cannot be removed: remove the folder"
         self._warn_once(
             "damaged",

@@ -99,7 +99,7 @@ def serve(
     from contextlib import ExitStack
 
     from ....schemas.archive.seal import read_archive_key
-    from ....schemas.kernels.compiling import has_compiled, kernel_files, without_linear_algebra
+    from ....schemas.kernels.compiling import has_compiled, kernel_files
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key
@@ -131,7 +131,6 @@ def serve(
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
-    without_linear_algebra()
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
         start.enter_context(compile_notices())

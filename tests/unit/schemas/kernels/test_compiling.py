@@ -167,20 +167,6 @@ def test_a_damaged_kernel_is_compiled_again(
     assert (again[0], json.loads(again[1]), again[2]) == (0, ANSWER | {"compiled": 0}, "")
 
 
-def test_kernels_need_no_linear_algebra_and_scipy_can_be_imported_later(cache: Path) -> None:
-    code = (
-        "from solidcloud.schemas.kernels.compiling import without_linear_algebra\n"
-        f"without_linear_algebra()\n{CODE}\n"
-        "import sys\nassert 'scipy.linalg' not in sys.modules\n"
-        "import scipy.linalg\nwithout_linear_algebra()\nassert 'scipy.linalg' in sys.modules\n"
-    )
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
-    out = subprocess.run(
-        [sys.executable, "-P", "-c", code], env=environment, capture_output=True, check=True, timeout=240
-    )
-    assert json.loads(out.stdout) == ANSWER | {"compiled": 0}
-
-
 def test_a_kernel_with_variables_of_its_surroundings_is_refused() -> None:
     """Their values would decide the machine code, and are in no source."""
     value = 3

@@ -3,7 +3,8 @@
 A file contains a magic number, a SHA-256 over its own name and its payload, and the payload. The
 payload is unpickled and run, so a file is used only if its digest is right, and a folder only if
 nobody else can write to it. A damaged file is removed, reported once, and compiled again. No file
-makes this module raise: a process that cannot use the folder compiles.
+makes this module raise: a process that cannot use the folder compiles. A package may deliver kernels
+in a folder of its own (scripts/build_wheel): what the folder lacks is looked for there.
 """
 
 import contextlib
@@ -27,6 +28,8 @@ _SUFFIX = ".kernel"
 _TEMPORARY = ".tmp"
 _STARTING = ".starting"
 _COMPILING = ".compiling"
+# An empty file: delivered kernels are not used.
+_REFUSED = "delivered.refused"
 _DAY = 86_400.0
 # Longest wait for another process that compiles a kernel; most take less than a second.
 _CLAIM_SECONDS = 60.0
@@ -55,12 +58,14 @@ class KernelFiles:
 
     def __init__(self, folder: Path, delivered: Path | None = None) -> None:
         self.folder = folder
-        self._delivered = delivered
         self._warned: set[str] = set()
+        self._fault = ""  # why the folder cannot be used
         self._pruned = False
         self.has_waited = False  # whether another process was found compiling
         self._claims: dict[str, int] = {}
         self._descriptor = self._open()
+        refused = self._descriptor is not None and self._stat(_REFUSED) is not None
+        self._delivered = None if refused else delivered
 
     def __del__(self) -> None:
         """Remove the marks of what was not written, and close the folder."""
@@ -75,7 +80,10 @@ class KernelFiles:
         Without a file, wait while another process compiles it; the first process is to write it.
         """
         if self._descriptor is None:
-            return self._read_delivered(name)
+            payload = self._read_delivered(name)
+            if payload is None:
+                self._warn_not_stored(self._fault)
+            return payload
         try:
             content = self._content(name)
         except FileNotFoundError:
@@ -102,6 +110,7 @@ class KernelFiles:
     def write(self, name: str, payload: bytes) -> None:
         """Write a payload under `name`, atomically."""
         if self._descriptor is None:
+            self._warn_not_stored(self._fault)
             return
         if not self._pruned:
             self._pruned = True
@@ -133,9 +142,13 @@ class KernelFiles:
         )
 
     def remove_all(self) -> None:
-        """Remove every compiled kernel."""
+        """Remove every compiled kernel, and use delivered ones no longer."""
         for name in self._names(_SUFFIX):
             self._remove(name)
+        self._delivered = None
+        if self._descriptor is not None:
+            with contextlib.suppress(OSError):
+                self._create(_REFUSED)
 
     def prune(self, max_bytes: int = MAX_BYTES, max_days: float = MAX_DAYS) -> None:
         """Remove files not used for `max_days`, then the least recently used beyond `max_bytes`."""
@@ -218,21 +231,21 @@ class KernelFiles:
             os.close(mark)
 
     def _open(self) -> int | None:
-        """Open the folder, created if needed. If it cannot be used, log that and return None."""
+        """Open the folder, created if needed. If it cannot be used, note why and return None."""
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             with contextlib.suppress(FileExistsError):
                 self.folder.mkdir(mode=0o700)
             descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError as error:
-            self._warn_not_stored(error.strerror or str(error))
+            self._fault = error.strerror or str(error)
             return None
         found = os.fstat(descriptor)
         if found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             return descriptor
         os.close(descriptor)
         mode = stat.S_IMODE(found.st_mode)
-        self._warn_not_stored(f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700")
+        self._fault = f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700"
         return None
 
     def _content(self, name: str) -> bytes:

@@ -105,6 +105,17 @@ def test_a_warm_start_compiles_nothing_and_is_silent(cache: Path) -> None:
     assert start(cache) == (ANSWER | {"compiled": 0}, [])
 
 
+def test_no_fact_of_the_machine_decides_which_kernel_is_used(cache: Path) -> None:
+    elsewhere = {
+        "HOME": str(cache),
+        "CUDA_HOME": "/opt/cuda",
+        "NUMBA_NUM_THREADS": "1",
+        "NUMBA_COLOR_SCHEME": "blue",
+    }
+    assert start(cache, **elsewhere) == (ANSWER | {"compiled": 0}, [])
+    assert start(cache, NUMBA_OPT="2")[0] == ANSWER | {"compiled": 2}
+
+
 def flip(paths: list[Path]) -> None:
     random.seed(2012)
     for path in paths:

@@ -33,7 +33,7 @@ _REFUSED = "delivered.refused"
 _DAY = 86_400.0
 # Longest wait for another process that compiles a kernel; most take less than a second.
 _CLAIM_SECONDS = 60.0
-# Limits of the folder. All kernels of one version of this package take 76 MB (scripts/bench_compile).
+# Limits of the folder. All kernels of one version of this package take 25 MB, of each family of processors.
 MAX_BYTES = 1 << 29
 MAX_DAYS = 60.0
 

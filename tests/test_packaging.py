@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from project_scripts import load_script
 
 ROOT = Path(__file__).resolve().parent.parent
 DISTRIBUTION = metadata.distribution("solidcloud")
@@ -90,3 +91,21 @@ def test_laspy_2_6_0_which_does_not_import_is_not_allowed() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     (laspy,) = (wanted for wanted in map(Requirement, extras["readers"]) if wanted.name == "laspy")
     assert not laspy.specifier.contains("2.6.0") and laspy.specifier.contains("2.6.1")
+
+
+def test_a_wheel_with_kernels_requires_the_versions_that_they_belong_to(tmp_path: Path) -> None:
+    project = tmp_path / "pyproject.toml"
+    project.write_text((ROOT / "pyproject.toml").read_text())
+    load_script("build_wheel").pin(project, (ROOT / "scripts/requirements.txt").read_text())
+    required = [Requirement(text) for text in tomllib.loads(project.read_text())["project"]["dependencies"]]
+    exact = {each.name: str(each.specifier) for each in required if each.name in ("numba", "llvmlite")}
+    assert exact == {name: f"=={pins()[name]}" for name in ("numba", "llvmlite")}
+    (numpy,) = (each.specifier for each in required if each.name == "numpy" and "==" in str(each.specifier))
+    assert numpy.contains(pins()["numpy"]) and not numpy.contains("3.0")
+
+
+def test_a_wheel_with_kernels_carries_those_that_python_calls(tmp_path: Path) -> None:
+    for name in ("a-1.kernel", "a.inner-2.kernel", "b-3.compiling"):
+        (tmp_path / name).touch()
+    load_script("build_wheel").add_kernels(tmp_path, tmp_path / "compiled")
+    assert [path.name for path in (tmp_path / "compiled").iterdir()] == ["a-1.kernel"]

@@ -1,35 +1,32 @@
 """Compilation of kernels, and the cache of compiled code.
 
-Only this module and kernel_dispatcher.py import numba.
+Only this module and kernel_dispatcher.py import numba; that one alone uses what numba does not
+document.
 
 numba's own cache unpickles and runs whatever its files contain, does not notice an edit in another
 file, and numbers its data files so that two processes may take the same number for two signatures.
 Here a file's name is a digest of everything that determines the machine code: the sources, the
-signature, the processor, the versions and numba's settings. `schemas/kernels/kernel_files.py` checks its
-content.
+signature, the family of processors, the versions and numba's settings. No path and nothing else of
+the machine takes part, so that compiled code can be delivered (scripts/build_wheel).
+`schemas/kernels/kernel_files.py` checks a file's content.
 """
 
 import functools
 import hashlib
-import importlib
-import pickle
-import sys
+import importlib.machinery
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import llvmlite
 import numba
 import numpy as np
-from numba.core import config as numba_config
 from numba.core import types
-from numba.core.caching import _Cache
-from numba.core.compiler import CompileResult
-from numba.core.serialize import dumps
 from numba.experimental import structref
 from numba.extending import intrinsic, overload
 
 from .compile_progress import CompileProgress
-from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
+from .kernel_dispatcher import Kernel, config
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
 
@@ -44,14 +41,24 @@ __all__ = [
     "overload",
     "structref",
     "types",
-    "without_linear_algebra",
 ]
 
-# numba creates its attributes on import, invisible to type checkers.
-config: Any = numba_config
-
-# numba settings that do not affect machine code and differ between processes.
-_UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
+# numba's settings that affect machine code; its name for them begins with NUMBA_.
+_SETTINGS = (
+    "BOUNDSCHECK",
+    "DEBUGINFO_DEFAULT",
+    "ENABLE_PROFILING",
+    "EXTEND_VARIABLE_LIFETIMES",
+    "LLVM_REFPRUNE_FLAGS",
+    "LLVM_REFPRUNE_PASS",
+    "LOOP_VECTORIZE",
+    "NRT_STATS",
+    "OPT",
+    "SLP_VECTORIZE",
+    "USING_SVML",
+)
+# Kernels that the package brings along.
+_DELIVERED = Path(__file__).parent / "compiled"
 # A file name holds 255 bytes; the digest takes 64.
 _MAX_LABEL = 150
 _progress = CompileProgress()
@@ -66,11 +73,9 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
     def decorate(function: Callable[..., Any]) -> Any:
         if config.DISABLE_JIT:
             return function
-        kernel = Kernel(function, {"nopython": True, "boundscheck": None, **options})
-        if cache:
-            kernel._cache = _KernelCache(function, inner=False)
-            kernel.inner._cache = _KernelCache(function, inner=True)
-        return kernel
+        if cache and function.__closure__ is not None:
+            raise TypeError(f"kernel {function.__qualname__}: expected no variables of an enclosing function")
+        return Kernel(function, {"nopython": True, "boundscheck": None, **options}, _store if cache else None)
 
     return decorate
 
@@ -90,20 +95,6 @@ def on_first_compilation(call: Callable[[], object] | None) -> None:
     _progress.on_first = call
 
 
-def without_linear_algebra() -> None:
-    """Make numba load its array functions without linear algebra, which no kernel uses.
-
-    numba otherwise imports scipy.linalg, if it is installed, before the first kernel: 0.1 s of a
-    server's start. Only for a process in which nobody else uses numba.
-    """
-    if "scipy.linalg" not in sys.modules:
-        sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # an import of it fails
-        try:
-            importlib.import_module("numba.np.arraymath")
-        finally:
-            del sys.modules["scipy.linalg"]
-
-
 def has_compiled() -> bool:
     """Return whether no file held some function, so that this or another process compiles it."""
     return _progress.any or kernel_files().has_waited
@@ -112,87 +103,59 @@ def has_compiled() -> bool:
 @functools.cache
 def kernel_files() -> KernelFiles:
     """Return this process's folder of compiled kernels."""
-    return KernelFiles(default_folder(config.CACHE_DIR))
+    return KernelFiles(default_folder(config.CACHE_DIR), _DELIVERED)
 
 
-class _KernelCache(_Cache):  # type: ignore[misc]
-    """Cache of one function's compiled code, with numba's cache interface.
+class _KernelStore:
+    """The store of compiled code, for kernel_dispatcher.py."""
 
-    inner: for calls from other kernels, not from Python.
-    """
-
-    def __init__(self, function: Callable[..., Any], *, inner: bool) -> None:
-        if function.__closure__ is not None:
-            raise TypeError(f"kernel {function.__qualname__}: expected no variables of an enclosing function")
-        self._function = function
-        self._inner = inner
-        self._enabled = True
-
-    @property
-    def cache_path(self) -> str:
-        """Return the folder, for numba's statistics."""
-        return str(kernel_files().folder)
-
-    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """Return the compiled code for a signature; None if nothing usable is stored."""
-        if not self._enabled:
-            return None
-        target_context.refresh()
-        name = self._name(sig, target_context.codegen())
-        payload = kernel_files().read(name)
-        if payload is None:
-            _progress.begin()
-            return None
-        try:
-            stored, reduced = pickle.loads(payload)
-            if stored != sig:
-                raise ValueError(f"it is for {stored}, expected {sig}")
-            rebuild = rebuild_inner if self._inner else CompileResult._rebuild
-            return rebuild(target_context, *reduced)
-        except Exception as error:
-            kernel_files().discard(name, f"{type(error).__name__}: {error}")
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Store the compiled code for a signature."""
-        _progress.end()
-        if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
-            return
-        reduced = reduce_inner(data) if self._inner else data._reduce()
-        kernel_files().write(self._name(sig, data.codegen), dumps((sig, reduced)))
-
-    def enable(self) -> None:
-        """Enable the cache."""
-        self._enabled = True
-
-    def disable(self) -> None:
-        """Disable reading and writing of the cache."""
-        self._enabled = False
-
-    def flush(self) -> None:
-        """Do nothing: a file with a valid name and digest stays valid."""
-
-    def _name(self, sig: Any, codegen: Any) -> str:
-        """Return the file name for a signature and a processor."""
-        module, qualname = self._function.__module__, self._function.__qualname__
+    def name(self, function: Callable[..., Any], inner: bool, sig: Any, target: tuple[str, ...]) -> str:
+        """Return the file name of a function's code for a signature and a family of processors."""
+        module, qualname = function.__module__, function.__qualname__
         decides = (
-            self._inner,
+            inner,
             _settings(),
             source_digest(module).hex(),
             module,
             qualname,
-            self._function.__code__.co_firstlineno,
-            codegen.magic_tuple(),
+            function.__code__.co_firstlineno,
+            target,
             sig,
         )
         digest = hashlib.sha256(repr(decides).encode()).hexdigest()
-        label = f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + ".inner" * self._inner
+        label = f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + ".inner" * inner
         return label + f"-{digest}.kernel"
+
+    def read(self, name: str) -> bytes | None:
+        """Return what is stored; None if it is to be compiled."""
+        payload = kernel_files().read(name)
+        if payload is None:
+            _progress.begin()
+        return payload
+
+    def write(self, name: str, payload: bytes) -> None:
+        """Store compiled code."""
+        _progress.end()
+        kernel_files().write(name, payload)
+
+    def discard(self, name: str, fault: str) -> None:
+        """Remove code that cannot be used; an empty fault is not reported."""
+        kernel_files().discard(name, fault)
+
+
+_store = _KernelStore()
 
 
 @functools.cache
 def _settings() -> tuple[Any, ...]:
-    """Return versions and numba's settings that affect the machine code."""
-    names = [name for name in dir(config) if name.isupper() and name not in _UNRELATED]
-    versions = (sys.version, numba.__version__, llvmlite.__version__, np.__version__)
-    return (*versions, *((name, repr(getattr(config, name))) for name in names))
+    """Return versions and numba's settings that affect the machine code.
+
+    Of Python and numpy, code depends on what their patch releases keep.
+    """
+    versions = (
+        importlib.machinery.EXTENSION_SUFFIXES[0],  # version of Python, system, processor
+        numba.__version__,
+        llvmlite.__version__,
+        np.__version__.rpartition(".")[0],
+    )
+    return (*versions, *((name, repr(getattr(config, name))) for name in _SETTINGS))

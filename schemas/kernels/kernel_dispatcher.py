@@ -2,27 +2,52 @@
 
 numba compiles every function for both uses at once: for Python with two wrappers and machine code,
 for other compiled functions as LLVM code that is linked into them. Most kernels have one of these
-uses. `Kernel` compiles for a use when it is first needed. The code for other kernels is neither
-optimised as a whole nor translated to machine code: that is done once, in the unit of the kernel
-that Python calls. Everything before the first answer of `collide` compiles in 24 s of processor
-time instead of 38 (scripts/bench_compile).
+uses. `Kernel` compiles for a use when it is first needed. The code for other kernels (`inner`) is
+neither linked with what it calls nor optimised as a whole nor translated to machine code: that is
+done once, in the unit of the kernel that Python calls. Of that unit only machine code is stored.
 
-This module uses parts of numba that may change with its next version: see pyproject.toml.
+This is the only module that uses parts of numba that are not documented and may change with its next
+version: see pyproject.toml. They are:
+
+- `CPUDispatcher`, its attributes `_compiler` and `_cache`, and its methods for calls from compiled
+  code (`get_call_template`, `get_overload`, `add_overload`);
+- `_FunctionCompiler` and `compile_extra`, which take a library for the result; `CompileResult`;
+- `JITCodeLibrary`: `_linking_libraries`, `_final_module`, `_shared_module`, `_reload_init` and the
+  steps of `finalize`; numba's object cache, which takes machine code in place of its own;
+- `_Cache`, the interface of numba's cache of a function, and `dumps`;
+- `Flags.values`, which is replaced by a faster one;
+- `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
+  family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
 
-from typing import Any
+import functools
+import pickle
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import llvmlite.binding as llvm
 import numba.core.compiler
 import numba.core.dispatcher
-from numba.core.codegen import JITCodeLibrary
+from numba.core import config as numba_config
+from numba.core.caching import _Cache
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.registry import CPUDispatcher
+from numba.core.runtime.nrt import rtsys
+from numba.core.serialize import dumps
 from numba.core.types import unliteral
 
 # numba creates their attributes on import, invisible to type checkers.
+config: Any = numba_config
 compiler: Any = numba.core.compiler
 dispatcher: Any = numba.core.dispatcher
 _Dispatcher: Any = CPUDispatcher
+
+# LLVM's names of families of processors, the best first, and what a processor has to have. AVX-512 is
+# a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and 1.1 times as long as with code for itself
+# alone (`collide`, `distance`), with x86-64-v4 0.82 and 1.05.
+_V3 = ("avx2", "bmi", "bmi2", "cx16", "f16c", "fma", "lzcnt", "movbe", "popcnt", "sahf", "xsave")
+_V4 = (*_V3, "avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl")
+_FAMILIES = {"x86-64-v4": _V4, "x86-64-v3": _V3}
 
 _DEFAULTS: dict[str, Any] = compiler.Flags().values()
 
@@ -37,16 +62,80 @@ def _values(self: Any) -> dict[str, Any]:
 compiler.Flags.values = _values
 
 
+class _Codegen(JITCPUCodegen):  # type: ignore[misc]
+    """numba's code generator, for a family of processors instead of the one at hand.
+
+    Compiled code then serves all of them. A user's NUMBA_CPU_NAME and NUMBA_CPU_FEATURES take
+    precedence.
+    """
+
+    def _get_host_cpu_name(self) -> str:
+        return _family() or super()._get_host_cpu_name()
+
+    def _get_host_cpu_features(self) -> str:
+        return "" if _family() else super()._get_host_cpu_features()
+
+
+@functools.cache
+def _family() -> str:
+    """Return the name of the family; "" for the processor at hand, or for what the user chose."""
+    if config.CPU_NAME is not None or config.CPU_FEATURES is not None:
+        return ""
+    machine = llvm.get_process_triple().partition("-")[0]
+    if machine in ("aarch64", "arm64"):
+        return "generic"
+    found = llvm.get_host_cpu_features() if machine == "x86_64" else {}
+    return next((name for name, needed in _FAMILIES.items() if all(map(found.get, needed))), "")
+
+
+@functools.cache
+def _codegen() -> _Codegen:
+    """Return the code generator of kernels; numba's own goes on to compile other functions."""
+    return _Codegen("solidcloud")
+
+
+class Store(Protocol):
+    """Place of compiled code; every method takes the name of the code."""
+
+    def name(self, function: Callable[..., Any], inner: bool, sig: Any, target: tuple[str, ...]) -> str:
+        """Return the name of a function's code for a signature and a target."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return what is stored; None if nothing is."""
+
+    def write(self, name: str, payload: bytes) -> None:
+        """Store compiled code."""
+
+    def discard(self, name: str, fault: str) -> None:
+        """Remove code that cannot be used; an empty fault is not reported."""
+
+
+class _StaleError(Exception):
+    """Code that calls code which has been compiled again since."""
+
+
+# Kernels by module and name, for stored code to find what it calls.
+_kernels: dict[tuple[str, str], "Kernel"] = {}
+
+
 class Kernel(_Dispatcher):  # type: ignore[misc]
     """Function that Python calls, and that other kernels call as `inner`.
 
-    function: its source.  options: numba's.
+    function: its source.  options: numba's.  store: where its code is kept; None for nowhere.
     """
 
-    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+    def __init__(self, function: Any, options: dict[str, Any], store: Store | None) -> None:
         super().__init__(function, targetoptions=options)
-        self._compiler = _KernelCompiler(self)
-        self.inner = InnerKernel(function, options)
+        self._compiler.__class__ = _KernelCompiler
+        self._store = store
+        if store is not None:
+            self._cache = _StoredCode(function, store, inner=False)
+            _kernels[function.__module__, function.__qualname__] = self
+
+    @functools.cached_property
+    def inner(self) -> "InnerKernel":
+        """Return the function for calls from other kernels."""
+        return InnerKernel(self.py_func, self.targetoptions, self._store)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call from another kernel."""
@@ -56,13 +145,18 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
         """Return the key of the code that another kernel calls."""
         return self.inner.get_overload(sig)
 
+    def _compilation_chain_init_hook(self) -> None:
+        """Do not look for numba's extensions before a call: compilation does, stored code needs none."""
+
 
 class InnerKernel(_Dispatcher):  # type: ignore[misc]
-    """Function that only other kernels can call."""
+    """Function that only other kernels can call. Parameters as `Kernel`."""
 
-    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+    def __init__(self, function: Any, options: dict[str, Any], store: Store | None) -> None:
         super().__init__(function, targetoptions=options)
-        self._compiler = _InnerCompiler(self)
+        self._compiler.__class__ = _InnerCompiler
+        if store is not None:
+            self._cache = _StoredCode(function, store, inner=True)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.
@@ -81,18 +175,11 @@ class InnerKernel(_Dispatcher):  # type: ignore[misc]
 class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
     """numba's compiler of a function that Python calls."""
 
-    def __init__(self, kernel: Any) -> None:
-        super().__init__(
-            kernel.py_func,
-            kernel.targetdescr,
-            kernel.targetoptions,
-            kernel.locals,
-            kernel._compiler.pipeline_class,
-        )
-
     def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
-        compiled = self._compile(args, return_type, compiler.Flags(), None)
+        flags = compiler.Flags()
+        flags.no_cfunc_wrapper = True
+        compiled = self._compile(args, return_type, flags, _KernelLibrary)
         # numba sets the environment of a function in that function's own machine code; an inner
         # kernel has none.
         for environment in compiled._find_referenced_environments():
@@ -100,16 +187,19 @@ class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
         return compiled
 
     def _compile(self, args: Any, return_type: Any, flags: Any, library: Any) -> Any:
+        target = self.targetdescr.target_context
         self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        code = library(_codegen(), self.py_func.__qualname__)
+        code.enable_object_caching()
         return compiler.compile_extra(
             self.targetdescr.typing_context,
-            self.targetdescr.target_context,
+            target,
             self.py_func,
             args,
             return_type,
             flags,
             self.locals,
-            library,
+            code,
             self.pipeline_class,
         )
 
@@ -119,12 +209,16 @@ class _InnerCompiler(_KernelCompiler):
 
     def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
-        target = self.targetdescr.target_context
-        library = _InnerLibrary(target.codegen(), self.py_func.__qualname__)
         flags = compiler.Flags()
         flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.no_compile = True
-        compiled = self._compile(args, return_type, flags, library)._replace(entry_point=_InnerKey())
-        target.insert_user_function(compiled.entry_point, compiled.fndesc, [library])
+        compiled = self._compile(args, return_type, flags, _InnerLibrary)._replace(entry_point=_InnerKey())
+        compiled.library.key = (
+            self.py_func.__module__, self.py_func.__qualname__, compiled.signature.args,
+            compiled.fndesc.llvm_func_name,
+        )  # fmt: skip
+        self.targetdescr.target_context.insert_user_function(
+            compiled.entry_point, compiled.fndesc, [compiled.library]
+        )
         return compiled
 
 
@@ -133,63 +227,204 @@ class _InnerKey:
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM code of a function and of all that it calls."""
+    """LLVM code of a function and of numba's functions that it calls.
+
+    callees: the inner kernels that it calls.  key: module and name of its kernel, types of its
+    arguments, name of its LLVM function.
+    """
+
+    key: tuple[str, str, Any, str]
+
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        self.callees: list[_InnerLibrary] = []
 
     def finalize(self) -> None:
-        """Link the code of the functions that are called."""
+        """Link the code of numba's functions that are called."""
         self._raise_if_finalized()
         for library in dict.fromkeys(self._linking_libraries):
             self._reload_init.update(library._reload_init)
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+            if isinstance(library, _InnerLibrary):
+                self.callees.append(library)
+            else:
+                self._final_module.link_in(library._get_module_for_linking(), preserve=True)
         self._finalize_dynamic_globals()
         self._finalized = True
 
+    def own_module(self) -> Any:
+        """Return the LLVM code without that of inner kernels."""
+        return super()._get_module_for_linking()
 
-def reduce_inner(compiled: Any) -> tuple[Any, ...]:
-    """Return the parts of an inner kernel's code that a file stores."""
-    compiled.fndesc.typemap = compiled.fndesc.calltypes = None  # cannot be stored, nobody reads them
-    return (
-        compiled.library.name,
-        compiled.library._get_module_for_linking().as_bitcode(),
-        compiled.fndesc,
-        compiled.environment,
-        compiled.signature,
-        compiled.reload_init,
-        tuple(compiled._find_referenced_environments()),
-    )
+    def _get_module_for_linking(self) -> Any:
+        """Return the LLVM code with that of inner kernels, for functions that numba compiles."""
+        module = self.own_module().clone()
+        for library in in_order(self.callees):
+            module.link_in(library.own_module(), preserve=True)
+        return module
 
 
-def rebuild_inner(
+def in_order(libraries: list[_InnerLibrary]) -> list[_InnerLibrary]:
+    """Return inner kernels and all that they call, each after everything that calls it.
+
+    The linker takes a function only if something linked before calls it.
+    """
+    done: dict[_InnerLibrary, None] = {}
+
+    def visit(library: _InnerLibrary) -> None:
+        if library not in done:
+            for callee in library.callees:
+                visit(callee)
+            done[library] = None
+
+    for library in libraries:
+        visit(library)
+    return list(reversed(done))
+
+
+class _KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code of a function and of all that it calls."""
+
+    def finalize(self) -> None:
+        """Link all that is called, once, and compile."""
+        libraries = dict.fromkeys(self._linking_libraries)
+        inner = in_order([library for library in libraries if isinstance(library, _InnerLibrary)])
+        self._linking_libraries = [library for library in libraries if not isinstance(library, _InnerLibrary)]
+        for library in inner:
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library.own_module(), preserve=True)
+        super().finalize()
+
+    def load(self, code: bytes) -> None:
+        """Take stored machine code instead of compiling."""
+        self.enable_object_caching()
+        self._set_compiled_object(code)
+        self._finalize_final_module()
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return the address of a function that this machine code has."""
+        self._ensure_finalized()
+        return self._codegen._engine.get_function_address(name)
+
+
+class _StoredCode(_Cache):  # type: ignore[misc]
+    """Stored code of one function, with numba's cache interface.
+
+    inner: for calls from other kernels, not from Python.
+    """
+
+    cache_path = ""
+
+    def __init__(self, function: Callable[..., Any], store: Store, *, inner: bool) -> None:
+        self._function, self._store, self._inner = function, store, inner
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the code for a signature; None if nothing usable is stored."""
+        name = self._name(sig)
+        payload = self._store.read(name)
+        if payload is None:
+            return None
+        try:
+            stored, parts = pickle.loads(payload)
+            if stored != sig:
+                raise ValueError(f"it is for {stored}, expected {sig}")
+            return (_rebuild_inner if self._inner else _rebuild)(target_context, *parts)
+        except _StaleError:
+            self._store.discard(name, "")
+        except Exception as error:
+            self._store.discard(name, f"{type(error).__name__}: {error}")
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Store the code for a signature."""
+        if data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
+            return
+        data.fndesc.typemap = data.fndesc.calltypes = None  # cannot be stored, nobody reads them
+        library = data.library
+        if self._inner:
+            code = library.own_module().as_bitcode(), library.key, [each.key for each in library.callees]
+        else:
+            code = library._get_compiled_object()
+        environments = tuple(data._find_referenced_environments())
+        parts = (
+            library.name, code, data.fndesc, data.environment, data.signature, data.reload_init, environments,
+        )  # fmt: skip
+        self._store.write(self._name(sig), dumps((sig, parts)))
+
+    def _name(self, sig: Any) -> str:
+        return self._store.name(self._function, self._inner, sig, _codegen().magic_tuple())
+
+    def enable(self) -> None:
+        """Do nothing: stored code is always used."""
+
+    def disable(self) -> None:
+        """Do nothing, as `enable`."""
+
+    def flush(self) -> None:
+        """Do nothing: code with a valid name stays valid."""
+
+
+def _rebuild(
+    target: Any, name: str, code: bytes, fndesc: Any, env: Any, sig: Any, reload_init: Any, environments: Any
+) -> Any:
+    """Return a kernel's code from the parts that `save_overload` stored."""
+    rtsys.initialize(target)  # numba's memory management, which the code calls
+    for initialise in reload_init:
+        initialise()
+    library = _KernelLibrary(_codegen(), name)
+    library.load(code)
+    entry_point = target.get_executable(library, fndesc, env)
+    for environment in environments:
+        library.codegen.set_env(environment.env_name, environment)
+    return _result(target, library, fndesc, env, sig, reload_init, environments, entry_point)
+
+
+def _rebuild_inner(
+    target: Any, name: str, code: Any, fndesc: Any, env: Any, sig: Any, reload_init: Any, environments: Any
+) -> Any:
+    """Return an inner kernel's code from the parts that `save_overload` stored.
+
+    Raises _StaleError if what it calls has been compiled again since.
+    """
+    for initialise in reload_init:
+        initialise()
+    library = _InnerLibrary(_codegen(), name)
+    bitcode, library.key, callees = code
+    for key in callees:
+        module, qualname, args, _ = key
+        inner = _kernels[module, qualname].inner
+        inner.compile(args)
+        callee = inner.overloads[args].library
+        if callee.key != key:
+            raise _StaleError
+        library.callees.append(callee)
+    library._final_module = library._shared_module = llvm.parse_bitcode(bitcode)
+    library._finalize_dynamic_globals()
+    library._finalized = True
+    return _result(target, library, fndesc, env, sig, reload_init, environments, _InnerKey())
+
+
+def _result(
     target: Any,
-    name: str,
-    code: bytes,
+    library: Any,
     fndesc: Any,
     environment: Any,
     signature: Any,
     reload_init: Any,
-    referenced: Any,
+    referenced_envs: Any,
+    entry_point: Any,
 ) -> Any:
-    """Return an inner kernel's code from the parts that `reduce_inner` returned."""
-    for initialise in reload_init:
-        initialise()
-    library = _InnerLibrary(target.codegen(), name)
-    library._final_module = library._shared_module = llvm.parse_bitcode(code)
-    library._finalize_dynamic_globals()
-    library._finalized = True
-    return compiler.CompileResult(
+    """Return numba's record of a compiled function."""
+    return compiler.compile_result(
         typing_context=target.typing_context,
         target_context=target,
-        entry_point=_InnerKey(),
-        typing_error=None,
+        entry_point=entry_point,
         type_annotation="",
         signature=signature,
         objectmode=False,
         lifted=(),
         fndesc=fndesc,
         library=library,
-        call_helper=None,
         environment=environment,
-        metadata=None,
         reload_init=reload_init,
-        referenced_envs=referenced,
+        referenced_envs=referenced_envs,
     )

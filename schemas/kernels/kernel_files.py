@@ -3,7 +3,8 @@
 A file contains a magic number, a SHA-256 over its own name and its payload, and the payload. The
 payload is unpickled and run, so a file is used only if its digest is right, and a folder only if
 nobody else can write to it. A damaged file is removed, reported once, and compiled again. No file
-makes this module raise: a process that cannot use the folder compiles.
+makes this module raise: a process that cannot use the folder compiles. A package may deliver kernels
+in a folder of its own (scripts/build_wheel): what the folder lacks is looked for there.
 """
 
 import contextlib
@@ -27,10 +28,12 @@ _SUFFIX = ".kernel"
 _TEMPORARY = ".tmp"
 _STARTING = ".starting"
 _COMPILING = ".compiling"
+# An empty file: delivered kernels are not used.
+_REFUSED = "delivered.refused"
 _DAY = 86_400.0
 # Longest wait for another process that compiles a kernel; most take less than a second.
 _CLAIM_SECONDS = 60.0
-# Limits of the folder. All kernels of one version of this package take 76 MB (scripts/bench_compile).
+# Limits of the folder. All kernels of one version of this package take 25 MB, of each family of processors.
 MAX_BYTES = 1 << 29
 MAX_DAYS = 60.0
 
@@ -49,16 +52,20 @@ def default_folder(cache: str) -> Path:
 class KernelFiles:
     """Folder of compiled kernels. Threads may share an instance; processes may share the folder.
 
-    folder: where the files are; created on first use.
+    folder: where the files are; created on first use.  delivered: a folder with more of them, which
+    is only read; it need not exist.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, delivered: Path | None = None) -> None:
         self.folder = folder
         self._warned: set[str] = set()
+        self._fault = ""  # why the folder cannot be used
         self._pruned = False
         self.has_waited = False  # whether another process was found compiling
         self._claims: dict[str, int] = {}
         self._descriptor = self._open()
+        refused = self._descriptor is not None and self._stat(_REFUSED) is not None
+        self._delivered = None if refused else delivered
 
     def __del__(self) -> None:
         """Remove the marks of what was not written, and close the folder."""
@@ -73,11 +80,15 @@ class KernelFiles:
         Without a file, wait while another process compiles it; the first process is to write it.
         """
         if self._descriptor is None:
-            return None
+            payload = self._read_delivered(name)
+            if payload is None:
+                self._warn_not_stored(self._fault)
+            return payload
         try:
             content = self._content(name)
         except FileNotFoundError:
-            return self.read(name) if self._claim(name) else None
+            payload = self._read_delivered(name)
+            return self.read(name) if payload is None and self._claim(name) else payload
         except OSError as error:
             self.discard(name, error.strerror or str(error))
             return None
@@ -87,9 +98,19 @@ class KernelFiles:
             return None
         return payload
 
+    def _read_delivered(self, name: str) -> bytes | None:
+        """Return a payload of the delivered kernels; None if there is none that may be used."""
+        if self._delivered is not None:
+            with contextlib.suppress(OSError):
+                content = (self._delivered / name).read_bytes()
+                if content[:_HEAD] == _head(name, content[_HEAD:]):
+                    return content[_HEAD:]
+        return None
+
     def write(self, name: str, payload: bytes) -> None:
         """Write a payload under `name`, atomically."""
         if self._descriptor is None:
+            self._warn_not_stored(self._fault)
             return
         if not self._pruned:
             self._pruned = True
@@ -109,8 +130,10 @@ class KernelFiles:
             self._release(name)
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove a damaged file, and log that on the first occurrence."""
+        """Remove a damaged file, and log that on the first occurrence; not without a fault."""
         removed = self._remove(name)
+        if not fault:
+            return
         outcome = "removed" if removed else "it cannot be removed: remove the folder"
         self._warn_once(
             "damaged",
@@ -119,9 +142,13 @@ class KernelFiles:
         )
 
     def remove_all(self) -> None:
-        """Remove every compiled kernel."""
+        """Remove every compiled kernel, and use delivered ones no longer."""
         for name in self._names(_SUFFIX):
             self._remove(name)
+        self._delivered = None
+        if self._descriptor is not None:
+            with contextlib.suppress(OSError):
+                self._create(_REFUSED)
 
     def prune(self, max_bytes: int = MAX_BYTES, max_days: float = MAX_DAYS) -> None:
         """Remove files not used for `max_days`, then the least recently used beyond `max_bytes`."""
@@ -204,21 +231,21 @@ class KernelFiles:
             os.close(mark)
 
     def _open(self) -> int | None:
-        """Open the folder, created if needed. If it cannot be used, log that and return None."""
+        """Open the folder, created if needed. If it cannot be used, note why and return None."""
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             with contextlib.suppress(FileExistsError):
                 self.folder.mkdir(mode=0o700)
             descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError as error:
-            self._warn_not_stored(error.strerror or str(error))
+            self._fault = error.strerror or str(error)
             return None
         found = os.fstat(descriptor)
         if found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             return descriptor
         os.close(descriptor)
         mode = stat.S_IMODE(found.st_mode)
-        self._warn_not_stored(f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700")
+        self._fault = f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700"
         return None
 
     def _content(self, name: str) -> bytes:

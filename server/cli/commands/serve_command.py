@@ -91,7 +91,7 @@ def serve(
     import sys
     from contextlib import ExitStack
 
-    from ....schemas.kernels.compiling import has_compiled, kernel_files, without_linear_algebra
+    from ....schemas.kernels.compiling import has_compiled, kernel_files
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key
@@ -121,7 +121,6 @@ def serve(
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
-    without_linear_algebra()
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
         start.enter_context(compile_notices())

@@ -3,8 +3,8 @@
 A digest shows that a kernel file holds what was written. It cannot show that its contents are right
 for this machine. Therefore a server marks its start (`KernelFiles.starting`). If the previous start
 did not complete, a child process first performs everything that a start does. If the child crashes,
-hangs or computes a wrong answer, all compiled kernels are removed and compiled again. A start that
-follows a complete one skips the trial.
+hangs or computes a wrong answer, all compiled kernels are removed, delivered ones are used no longer,
+and all are compiled again. A start that follows a complete one skips the trial.
 
 A wrong kernel may also make the check of a sound record fail. If the child finds a fault of the
 archive or scene file, a second child therefore looks for it with kernels that it compiles itself.
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import CorruptError, SolidcloudError
-from ....schemas.kernels.kernel_files import KernelFiles
+from ....schemas.kernels.kernel_files import KernelFiles, default_folder
 from ....schemas.wire.answers import Verdict
 from .child_processes import end_with_parent, lifeline
 
@@ -51,6 +51,7 @@ def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
     fault, data_fault = _run_trial(what, seconds, os.environ)
     if data_fault:
         with tempfile.TemporaryDirectory() as folder:
+            KernelFiles(default_folder(folder)).remove_all()  # so that delivered ones are not used
             again = _run_trial(what, seconds, {**os.environ, "NUMBA_CACHE_DIR": folder})
         if again == ("", data_fault):
             return

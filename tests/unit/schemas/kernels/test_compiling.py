@@ -105,6 +105,17 @@ def test_a_warm_start_compiles_nothing_and_is_silent(cache: Path) -> None:
     assert start(cache) == (ANSWER | {"compiled": 0}, [])
 
 
+def test_no_fact_of_the_machine_decides_which_kernel_is_used(cache: Path) -> None:
+    elsewhere = {
+        "HOME": str(cache),
+        "CUDA_HOME": "/opt/cuda",
+        "NUMBA_NUM_THREADS": "1",
+        "NUMBA_COLOR_SCHEME": "blue",
+    }
+    assert start(cache, **elsewhere) == (ANSWER | {"compiled": 0}, [])
+    assert start(cache, NUMBA_OPT="2")[0] == ANSWER | {"compiled": 2}
+
+
 def flip(paths: list[Path]) -> None:
     random.seed(2012)
     for path in paths:
@@ -165,20 +176,6 @@ def test_a_damaged_kernel_is_compiled_again(
     assert json.loads(out) == ANSWER | {"compiled": 1 if damage == "other name" else 2}
     assert len(said.splitlines()) == 1 and "is damaged" in said and cache in said
     assert (again[0], json.loads(again[1]), again[2]) == (0, ANSWER | {"compiled": 0}, "")
-
-
-def test_kernels_need_no_linear_algebra_and_scipy_can_be_imported_later(cache: Path) -> None:
-    code = (
-        "from solidcloud.schemas.kernels.compiling import without_linear_algebra\n"
-        f"without_linear_algebra()\n{CODE}\n"
-        "import sys\nassert 'scipy.linalg' not in sys.modules\n"
-        "import scipy.linalg\nwithout_linear_algebra()\nassert 'scipy.linalg' in sys.modules\n"
-    )
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
-    out = subprocess.run(
-        [sys.executable, "-P", "-c", code], env=environment, capture_output=True, check=True, timeout=240
-    )
-    assert json.loads(out.stdout) == ANSWER | {"compiled": 0}
 
 
 def test_a_kernel_with_variables_of_its_surroundings_is_refused() -> None:

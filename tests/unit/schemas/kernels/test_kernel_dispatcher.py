@@ -4,7 +4,8 @@ import os
 
 import numpy as np
 import pytest
-from solidcloud.schemas.kernels.compiling import njit
+from solidcloud.schemas.kernels.compiling import njit, types
+from solidcloud.schemas.kernels.kernel_dispatcher import in_order
 from solidcloud.schemas.kernels.morton import morton_code, morton_encode
 
 pytestmark = pytest.mark.skipif(
@@ -36,3 +37,28 @@ def test_a_kernel_has_the_same_result_for_python_and_for_a_kernel() -> None:
 def test_a_kernel_raises_what_an_inner_kernel_raises() -> None:
     with pytest.raises(ValueError, match="at least 0"):
         quarter(-1.0)
+
+
+@njit()
+def eighth(value):  # type: ignore[no-untyped-def]
+    """Return an eighth of a value."""
+    return half(quarter(value))
+
+
+def test_an_inner_kernel_holds_its_own_code_and_names_what_it_calls() -> None:
+    arguments = (types.float64,)
+    eighth.inner.compile(arguments)
+    library = eighth.inner.overloads[arguments].library
+    defined = [each.name for each in library.own_module().functions if not each.is_declaration]
+    assert any("eighth" in name for name in defined)
+    assert not any("half" in name or "quarter" in name for name in defined)
+    assert sorted(callee.key[1] for callee in library.callees) == ["half", "quarter"]
+
+
+def test_what_calls_is_linked_before_what_it_calls() -> None:
+    """Half is called by both, and must come after both."""
+    eighth.inner.compile((types.float64,))
+    library = eighth.inner.overloads[types.float64,].library
+    for callees in (library.callees, library.callees[::-1]):
+        assert [each.key[1] for each in in_order(callees)] == ["quarter", "half"]
+    assert eighth(4.0) == 0.5

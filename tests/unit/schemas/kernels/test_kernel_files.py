@@ -61,6 +61,25 @@ def test_every_flipped_bit_and_every_length_is_found(folder: Path, caplog: pytes
     assert len(lines(caplog)) == len(damaged), "one line each time"
 
 
+def test_delivered_kernels_are_read_unless_damaged_or_refused(
+    files: KernelFiles, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    files.write(NAME, PAYLOAD)
+    files.write("b.kernel", PAYLOAD)
+    (folder / "b.kernel").write_bytes(b"damaged")
+    delivered = folder.rename(tmp_path / "delivered")
+    with_them = KernelFiles(folder, delivered)
+    assert with_them.read(NAME) == PAYLOAD and list(folder.iterdir()) == []
+    assert with_them.read("b.kernel") is None
+    with_them.write("b.kernel", b"compiled")
+    assert with_them.read("b.kernel") == b"compiled"
+    (tmp_path / "file").write_bytes(b"")
+    assert KernelFiles(tmp_path / "file" / "kernels", delivered).read(NAME) == PAYLOAD
+    assert lines(caplog) == []
+    with_them.remove_all()
+    assert with_them.read(NAME) is None and KernelFiles(folder, delivered).read(NAME) is None
+
+
 def test_a_file_under_another_name_is_refused(files: KernelFiles, folder: Path) -> None:
     files.write(NAME, PAYLOAD)
     os.rename(folder / NAME, folder / "c.kernel")

@@ -248,7 +248,8 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
     `collide_poses`.  held: states of voxels.
     A finished pose is listed; by scan, its cells are left in the state. The call returns before a voxel
     that is not held; when the scene's stop flag is set; and if the table of cells has reached
-    `options.cells` and has no space for LANES more. Call again with the returned state, from the same pose on. Adds to `results`.
+    `options.cells` and has no space for LANES more. Call again with the returned state, from the same
+    pose on. Adds to `results`.
     """
     placed = make_placed(avatar)
     scratch = ContactScratch(

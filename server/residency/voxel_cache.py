@@ -48,7 +48,7 @@ class HeldVoxels(NamedTuple):
     hits: voxels that were resident or being loaded.  misses: voxels that were not.
     faults: one sentence for each unreadable voxel.
     late: rows that were not resident by the deadline. They may become resident during the hold:
-    ignore them when reading `where` (`as_held`).
+    ignore them when reading `where`.
     waited: time spent on loads, by this thread or others, and on waits for memory [s].
     """
 

@@ -71,7 +71,7 @@ class ContactOptions(NamedTuple):
     edges: (k,) int64, edge of a cell [steps].
     with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
-    cells: limit of the table of cells, a power of two.
+    cells: limit of the table of cells, a power of two.  listed: limit of the lists [bytes].
     """
 
     rows: NDArray[np.int32]
@@ -79,6 +79,7 @@ class ContactOptions(NamedTuple):
     with_scan: bool
     limit: int
     cells: int
+    listed: int
 
 
 class ContactScratch(NamedTuple):

@@ -80,7 +80,7 @@ def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp
             )
             visits.append(found.node_visits)
             tests.append(found.point_tests)
-    assert visits == [105, 111, 73] and tests == [1664, 2336, 1088]
+    assert visits == [105, 111, 73] and tests == [1664, 2048, 1088]
 
 
 @pytest.mark.interpreted

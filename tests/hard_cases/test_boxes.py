@@ -27,7 +27,6 @@ from solidcloud.server.kernels.nearest.block_distances import unmark_beyond_box
 from solidcloud.server.queries import nearest_hits
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
-from solidcloud.server.runtime.stop_flag import NO_STOP
 
 UNITS = 2**26
 # Steps and origins [m]: map coordinates, the largest ones, and numbers that no float64 holds exactly.

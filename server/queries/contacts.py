@@ -112,7 +112,8 @@ def contacts_steps(
     tally = ContactResults(np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros((k, 4), np.int64))
     memory, finished, level = empty_memory(limit), np.ones(k, bool), find_level(data, budget)
     options = ContactOptions(
-        avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS
+        avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS,
+        MAX_BYTES,
     )  # fmt: skip
 
     arrays = with_stop(data, budget.stop).arrays
@@ -134,7 +135,8 @@ def contacts_steps(
 
     if len(avatar.points):
         left = yield from resolve(data, reach.lists, search, budget, spent, settle, together=True)
-        finished = left == np.inf
+        # A stop may leave a pose without its lists.
+        finished = (left == np.inf) & ((tally.pairs == 0) | (tally.runs[:, 3] > 0))
         if memory.sizes[POSE] >= 0:  # what was found of the pose in hand
             memory = list_pose(memory, tally.runs[memory.sizes[POSE]], NO_STOP.flag)
     columns = _columns(data, reach, margin_units, tally, finished, memory, len(avatar.points) > 0)

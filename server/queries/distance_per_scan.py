@@ -11,7 +11,7 @@ from ..kernels.contacts.contact_cells import BY_SCAN, CELLS, DEFICIT, PLACE, SQU
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.reach import VoxelLists
 from .collide import clear_of_rows
-from .contacts import MAX_CELLS, empty_memory
+from .contacts import MAX_BYTES, MAX_CELLS, empty_memory
 from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
@@ -61,7 +61,7 @@ def separation_per_scan(
     if not len(avatar.points):
         return ScanSeparations({}, True)
     tally = ContactResults(np.zeros((3, 1), np.int64), np.zeros(1, np.int64), np.zeros((1, 4), np.int64))
-    options = ContactOptions(avatar.rows, np.full(1, BY_SCAN), True, 0, MAX_CELLS)
+    options = ContactOptions(avatar.rows, np.full(1, BY_SCAN), True, 0, MAX_CELLS, MAX_BYTES)
     memory, level, arrays = empty_memory(0), find_level(data, budget), with_stop(data, budget.stop).arrays
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:

@@ -124,7 +124,7 @@ def _next_rows(
     where = data.arrays.where
     ahead = _distinct(lists.rows[cursor[open_]])
     later: NDArray[np.bool_] = np.zeros(len(where), bool)
-    later[lists.rows[: lists.starts[-1]]] = True
+    later[lists.rows[_entries(lists, cursor, open_)[0]]] = True
     later &= where[:, 0] >= 0
     later[ahead] = False
     return _that_fit(data, np.concatenate([ahead, np.flatnonzero(later)]))
@@ -137,14 +137,21 @@ def _whole_items(
 
     The voxels of a single item may not fit: then as many as do.
     """
-    counts = lists.starts[open_ + 1] - cursor[open_]
-    ends = np.cumsum(counts)
-    entries = np.arange(ends[-1]) + np.repeat(cursor[open_] - ends + counts, counts)
+    entries, ends = _entries(lists, cursor, open_)
     listed = lists.rows[entries]
     rows = _that_fit(data, _distinct(listed))
     left_out = np.flatnonzero(~np.isin(listed, rows))
     whole = len(open_) if not len(left_out) else int(np.searchsorted(ends, left_out[0], side="right"))
     return open_[: max(1, whole)], rows
+
+
+def _entries(
+    lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the entries that the open items have left, item after item, and where each item's end."""
+    counts = lists.starts[open_ + 1] - cursor[open_]
+    ends = np.cumsum(counts)
+    return np.arange(ends[-1]) + np.repeat(cursor[open_] - ends + counts, counts), ends
 
 
 def _distinct(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -48,7 +48,7 @@ class HeldVoxels(NamedTuple):
     hits: voxels that were resident or being loaded.  misses: voxels that were not.
     faults: one sentence for each unreadable voxel.
     late: rows that were not resident by the deadline. They may become resident during the hold:
-    ignore them when reading `where` (`as_held`).
+    ignore them when reading `where`.
     waited: time spent on loads, by this thread or others, and on waits for memory [s].
     """
 
@@ -93,9 +93,7 @@ class VoxelCache:
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
     kept: rows at users' positions, evicted only if a request would not fit otherwise.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
-    on_proved: called with the row of each loaded voxel, whose record matches the index, by the
-    loading thread, before the voxel is visible to other threads.  on_load_time: called after each
-    load with its duration [s].
+    on_load_time: called after each load with its duration [s].
     stats: counts of the cache, written under its lock.
     misled: whether a loaded record contradicts the index. The index selects the voxels of a query;
     once it is wrong, it may have failed to select any voxel.
@@ -124,7 +122,6 @@ class VoxelCache:
         self.where = np.full((len(sizes), 3), -1, np.int64)
         self.kept: frozenset[int] = frozenset()
         self.on_owed: Callable[[], None] | None = None
-        self.on_proved: Callable[[int], None] | None = None
         self.on_load_time: Callable[[float], None] | None = None
         self.misled = False
         self.policy = policy or EvictionPolicy(budget_bytes)
@@ -380,8 +377,6 @@ class VoxelCache:
         begin, where, fault, corrupt = time.perf_counter(), None, "", False
         try:
             where = self._store.load(row, self.buffer.arena, self._allocator.offsets[row])
-            if self.on_proved is not None:
-                self.on_proved(row)
         except CorruptError as error:
             fault, corrupt = str(error), True
             self.misled |= isinstance(error, MisleadingIndexError)

@@ -4,6 +4,7 @@ import itertools
 import math
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import archive_cases
@@ -19,16 +20,13 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import cover_units, open_level
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.kernels.core.placed_avatar import make_placed, place_root
+from solidcloud.server.kernels.core.reach import INFINITE, VoxelTree, entry_fraction, make_voxel_tree
 from solidcloud.server.kernels.core.scene_arrays import LANES, ROW_WORDS, SceneArrays
-from solidcloud.server.kernels.core.voxel_tree import VoxelLists, list_voxels, make_voxel_tree
-from solidcloud.server.kernels.core.voxels_in_reach import VALID, SceneIndex, VoxelsInReach, find_reach
-from solidcloud.server.kernels.motion.sweep_segments import INFINITE, entry_fraction
+from solidcloud.server.kernels.core.voxels_in_reach import VALID, find_reach, make_reach
 from solidcloud.server.kernels.nearest.block_distances import unmark_beyond_box
-from solidcloud.server.kernels.nearest.missing_voxels import box_distance
+from solidcloud.server.queries import nearest_hits
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
-from solidcloud.server.runtime.stop_flag import NO_STOP
 
 UNITS = 2**26
 # Steps and origins [m]: map coordinates, the largest ones, and numbers that no float64 holds exactly.
@@ -52,32 +50,36 @@ def fractions(values: Any) -> Vector:
 
 def boxed_scene(
     rng: np.random.Generator, step: float, origin: tuple[float, ...]
-) -> tuple[SceneArrays, SceneIndex]:
-    """Return a scene of six voxels with boxes and no points, none in memory."""
+) -> tuple[SceneArrays, VoxelTree]:
+    """Return a scene of six voxels with boxes and no points, none in memory.
+
+    Two scans that were left out have the boxes of the last two voxels.
+    """
     steps = int(rng.choice([7, 1000, 70_000, 1 << 20]))
     # Such that all of it lies within 1e9 m.
     farthest = min(1 << 19, int(2e8 / step / steps))
     coordinates = rng.integers(-farthest, farthest, (6, 3))
     coordinates[1:3] = coordinates[0] + [[1, 0, 0], [0, -1, 1]]
     keys = voxel_keys(coordinates)
-    coordinates, keys = coordinates[np.argsort(keys)], np.sort(keys)
+    coordinates = coordinates[np.argsort(keys)]
     inside = np.sort(rng.integers(0, steps, (2, 6, 3)), axis=0)
     low, high = inside + coordinates * steps
     arrays = SceneArrays(
         np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.uint16), np.full((6, 3), -1, np.int64),
         coordinates, np.array(origin), step, step * UNITS, steps, 4, np.zeros(1, np.int64), np.zeros(1, np.int64),
     )  # fmt: skip
-    return arrays, SceneIndex(keys, low, high, low.min(axis=0), high.max(axis=0))
+    bounds = np.stack([low.min(axis=0), high.max(axis=0)])
+    return arrays, make_voxel_tree(low, high, bounds, np.stack([low, high], axis=1)[4:])
 
 
 def poses_beside(
-    rng: np.random.Generator, scene: SceneArrays, index: SceneIndex, count: int
+    rng: np.random.Generator, scene: SceneArrays, tree: VoxelTree, count: int
 ) -> NDArray[np.float64]:
     """Return poses at corners and edges of boxes, and away from them by up to some metres."""
     poses = []
     for _ in range(count):
-        row, low = int(rng.integers(len(index.keys))), rng.random(3) < 0.5
-        corner = np.where(low, index.low[row], index.high[row]) * scene.step
+        row, low = int(rng.integers(tree.voxels)), rng.random(3) < 0.5
+        corner = np.where(low, tree.low[row], tree.high[row]) * scene.step
         away = rng.normal(size=3) * (rng.random(3) < 0.6) * rng.choice([0.0, 1e-8, 1e-3, 0.5, 5.0])
         turn = np.eye(3) if rng.random() < 0.3 else archive_cases.random_rotation(rng)
         poses.append(archive_cases.pose_of(turn, np.array(scene.origin) + corner + away))
@@ -96,7 +98,7 @@ def placed_exactly(body: AvatarModel, pose: NDArray[np.float64], scene: SceneArr
 
 @pytest.mark.case(
     39,
-    "box_distance and the broad phase at 1e9 m, steps of 1 µm to 30 cm: at most the true distance, in fractions",
+    "the broad phase at 1e9 m, steps of 1 µm to 30 cm: no voxel left out, `near` at most the distance, in fractions",
 )
 @pytest.mark.parametrize("origin", ORIGINS)
 @pytest.mark.parametrize("step", STEPS)
@@ -106,41 +108,40 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
     rng = np.random.default_rng(39)
     closest = 0
     for count in (1, 5):
-        scene, index = boxed_scene(rng, step, origin)
+        scene, tree = boxed_scene(rng, step, origin)
         body = make_avatar(np.rint(rng.uniform(-0.2, 0.2, (count, 3)) * 1e6) / 1e6, 0.0)
         if count == 1:  # without the slack of its root sphere
             body = body._replace(arrays=body.arrays._replace(radius=np.zeros(len(body.arrays.radius))))
-        placed, exact_step = make_placed(body.arrays), Fraction(step)
-        poses = poses_beside(rng, scene, index, sample(6, 25))
+        exact_step = Fraction(step)
+        poses = poses_beside(rng, scene, tree, sample(6, 25))
         boxes = [
             ([f * exact_step for f in fractions(low)], [f * exact_step for f in fractions(high)])
-            for low, high in zip(index.low, index.high, strict=True)
+            for low, high in zip(tree.low[:6], tree.high[:6], strict=True)
         ]
         for pose in poses:
             points = placed_exactly(body, pose, scene)
             in_units = [fractions(point) for point in naive.placed_units(body.points, pose, scene.origin)]
-            _, farthest = place_root(body.arrays, pose, placed, scene)
-            for row, (low, high) in enumerate(boxes):
-                square = min(beyond(point, low, high) for point in points)
-                gap = Fraction(box_distance(body.arrays.radius[0], placed, farthest, scene, index, row))
-                assert (gap * exact_step) ** 2 <= square, (float(gap), float(square))
+            squares = [min(beyond(point, *box) for point in points) for box in boxes]
+            for row in range(6):
                 # The least reach at which a point at the nearest place of the box is in contact (N5).
                 sides = [
-                    fractions(np.rint(side[row] * scene.units_per_step)) for side in (index.low, index.high)
+                    fractions(np.rint(side[row] * scene.units_per_step)) for side in (tree.low, tree.high)
                 ]
                 nearest = min(int(beyond(point, *sides)) for point in in_units)
                 units = math.isqrt(nearest)
                 units += units * units < nearest
                 if units > 1 << 30 or units / UNITS / step + scene.voxel_steps > 1 << 22:
                     continue
-                reach = VoxelsInReach(
-                    np.empty(1, np.int64), np.zeros(2, np.int64), np.empty(6, np.int64),
-                    np.empty((1, 2, 3)), np.zeros(1, bool),
-                )  # fmt: skip
-                fault, *_ = find_reach(pose[None], body.arrays, 0.0, units, scene, index, reach)
-                assert fault == VALID and row in reach.rows[: reach.starts[1]]
+                reach = make_reach(1, 6)
+                fault, _, _, needed = find_reach(pose[None], body.arrays, 0.0, units, scene, tree, reach)
+                assert fault == VALID and row in reach.lists.rows[:needed]
                 closest += 1
-                # `unknown_gaps` and searches that are given up bound by the box of the reach without it.
+                near = [Fraction(gap) * exact_step for gap in reach.lists.near[:needed]]
+                for other, gap in zip(reach.lists.rows[:needed].tolist(), near, strict=True):
+                    assert gap * gap <= squares[other], (float(gap), float(squares[other]))
+                if row >= 4:  # such a box is also that of a scan left out
+                    assert (Fraction(reach.lists.unseen[0]) * exact_step) ** 2 <= min(squares[4:])
+                # `unknown_gaps` bounds by the box of the reach without it.
                 own = units / scene.units_per_step
                 first, last = fractions(reach.boxes[0, 0] + own), fractions(reach.boxes[0, 1] - own)
                 for point in points:
@@ -156,43 +157,42 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
 @pytest.mark.parametrize("step", STEPS)
 def test_case_39_lists_of_voxels_leave_none_out(step: float, origin: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(39)
-    scene, index = boxed_scene(rng, step, origin)
+    scene, tree = boxed_scene(rng, step, origin)
     k, per_step = sample(12, 40), Fraction(scene.units_per_step)
-    tree = make_voxel_tree(index.low, index.high, np.empty((0, 2, 3), np.int64))
-    places = poses_beside(rng, scene, index, k)[:, :3, 3]
+    places = poses_beside(rng, scene, tree, k)[:, :3, 3]
     places[::5] += rng.choice([-1.0, 1.0], (len(places[::5]), 3)) * 1e8  # far from all boxes
     at_units = np.rint((places - scene.origin) * UNITS).astype(np.int64)
     aims = rng.normal(size=(k, 3))
     aims[::4] = np.eye(3)[rng.integers(3, size=len(aims[::4]))] * rng.choice([-1.0, 1.0])
     aims[1::4, 0] *= 2.0**-60  # nearly along a face
-    aims[::5] = (index.low[0] + index.high[0]) * step / 2 - (places[::5] - scene.origin)
+    aims[::5] = (tree.low[0] + tree.high[0]) * step / 2 - (places[::5] - scene.origin)
     aims /= np.linalg.norm(aims, axis=1)[:, None]
     reach, radius = int(4e8 * UNITS), int(0.05 * UNITS)
+    data: Any = SimpleNamespace(arrays=scene, tree=tree)
     for along in (False, True):
-        lists = VoxelLists(np.zeros(k + 1, np.int64), np.zeros(6 * k, np.int64), np.zeros(6 * k), np.zeros(k))
-        needed = list_voxels(
-            tree, at_units, aims, along, reach, radius, scene.units_per_step, NO_STOP.flag, lists
-        )
-        assert needed <= 6 * k
+        lists = nearest_hits._list(data, at_units, aims if along else None, reach, radius if along else 0)
         found = 0
         for i, row in itertools.product(range(k), range(6)):
             own = slice(lists.starts[i], lists.starts[i + 1])
             near = dict(zip(lists.rows[own].tolist(), lists.near[own].tolist(), strict=True))
             at = fractions(at_units[i])
             # A lattice point in units is rounded half to even: by half a unit, or by float64 far away.
-            box = [fractions(np.rint(side[row] * scene.units_per_step)) for side in (index.low, index.high)]
-            exact = [[f * per_step for f in fractions(side[row])] for side in (index.low, index.high)]
+            box = [fractions(np.rint(side[row] * scene.units_per_step)) for side in (tree.low, tree.high)]
+            exact = [[f * per_step for f in fractions(side[row])] for side in (tree.low, tree.high)]
             for low, high in (box, exact):
                 if not along:
                     square = beyond(at, low, high)
-                    if square <= reach * reach:
-                        assert Fraction(near[row]) ** 2 <= square
-                        found += 1
-                    continue
-                enters = entered(at, fractions(aims[i]), low, high, Fraction(radius))
-                if enters is not None and enters <= reach:
-                    assert near[row] <= enters
-                    found += 1
+                    if square > reach * reach:
+                        continue
+                    assert (Fraction(near[row]) * per_step) ** 2 <= square
+                    assert row < 4 or (Fraction(lists.unseen[i]) * per_step) ** 2 <= square
+                else:
+                    enters = entered(at, fractions(aims[i]), low, high, Fraction(radius))
+                    if enters is None or enters > reach:
+                        continue
+                    assert Fraction(near[row]) * per_step <= enters
+                    assert row < 4 or Fraction(lists.unseen[i]) * per_step <= enters
+                found += 1
         assert found > k
 
 
@@ -234,8 +234,9 @@ def test_case_39_motions_enter_boxes_no_later_than_in_fractions() -> None:
             continue
         met += 1
         # The span as its callers widen it: a millionth of itself, one step, and the rounding far away.
+        boxes = low[None].astype(np.float64), high[None].astype(np.float64)
         wide = span * (1.0 + 1e-6) + 1.0 + max(np.abs(begin).max(), np.abs(end).max()) * 2.0**-49
-        found = entry_fraction(begin, end, wide, low, high)
+        found = entry_fraction(begin, end, wide, *boxes, 0)
         assert found != INFINITE and Fraction(found) <= first, (found, float(first))
     assert met > 50
 

@@ -104,7 +104,7 @@ def test_what_is_refused_is_refused_in_the_same_words(tmp_path: Path) -> None:
                             (np.eye(4), 1e3), (np.eye(3), 0.1), (np.diag([1.0, 1, 1, 2]), 0.1)):  # fmt: skip
             said = []
             for ask in (lambda p, r: distance_fast(scene._data, avatar, p, r),
-                        lambda p, r: distance(scene._data, avatar, p[None], r)):  # fmt: skip
+                        lambda p, r: distance(scene._data, avatar, p, r)):  # fmt: skip
                 with pytest.raises(SolidcloudError) as refused:
                     ask(pose, reach)
                 said.append((type(refused.value), str(refused.value)))

@@ -81,7 +81,7 @@ def test_a_cache_too_small_for_all_at_once_changes_no_gap(tmp_path: Path, rng: n
     case = contact_cases.open_case(tmp_path, points, rng, scan_count=3, voxel=0.5)
     avatar = make_avatar(rng.uniform(-0.5, 0.5, (60, 3)), 0.02)
     with closing(case.store):
-        largest = max(case.data.residency.bytes_of([row]) for row in range(len(case.data.broad.keys)))
+        largest = max(case.data.residency.bytes_of([row]) for row in range(len(case.data.keys)))
         small = contact_cases.tight(case, 2 * largest)
         for pose in archive_cases.near_poses(rng, points, avatar.points, 5, 0.1):
             whole = separation_per_scan(case.data, avatar, pose, 0.1, 3)

@@ -83,6 +83,10 @@ def check_others(looks: Looks, scene: Scene, poses: Any) -> None:
     for found in cut:
         assert (found.pairs_found <= full.pairs_found).all()
         assert not full.pairs_found[found.verdict == Verdict.CLEAR].any()
+        for column in ("pairs_found", "pair_starts", "cluster_starts"):
+            said, whole = (getattr(each, column) for each in (found, full))
+            said, whole = (np.diff(each) if column.endswith("starts") else each for each in (said, whole))
+            assert (said == whole)[found.exact].all(), column
     full, *cut = stops(looks, lambda **o: scene.sweep("body", poses[:-1], poses[1:], **o))
     for found in cut:
         assert (found.lower <= full.upper).all() and (found.upper >= full.lower).all()

@@ -73,7 +73,7 @@ class ContactOptions(NamedTuple):
     edges: (k,) int64, edge of a cell [steps]; BY_SCAN: a cell holds the points of one scan instead.
     with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
-    cells: limit of the table of cells, a power of two.
+    cells: limit of the table of cells, a power of two.  listed: limit of the lists [bytes].
     """
 
     rows: NDArray[np.int32]
@@ -81,6 +81,7 @@ class ContactOptions(NamedTuple):
     with_scan: bool
     limit: int
     cells: int
+    listed: int
 
 
 class ContactScratch(NamedTuple):

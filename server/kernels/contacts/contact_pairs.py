@@ -41,8 +41,11 @@ from ..core.scene_arrays import (
 from .contact_cells import (
     BY_SCAN,
     CELLS,
+    CLUSTER,
+    CLUSTERS,
     DEPTH,
     KEPT,
+    LISTED,
     POINT,
     POSE,
     RECORD,
@@ -247,9 +250,9 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.  cursor: as in
     `collide_poses`.  held: states of voxels.
     A finished pose is listed; by scan, its cells are left in the state. The call returns before a voxel
-    that is not held; when the scene's stop flag is set; and if the table of cells has reached
-    `options.cells` and has no space for LANES more. Call again with the returned state, from the same
-    pose on. Adds to `results`.
+    that is not held; when the scene's stop flag is set; if the table of cells has reached
+    `options.cells` and has no space for LANES more; and if the lists are longer than `options.listed`.
+    Call again with the returned state, from the same pose on. Adds to `results`.
     """
     placed = make_placed(avatar)
     scratch = ContactScratch(
@@ -292,4 +295,6 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
                 cursor[i] += 1
         if options.edges[i] != BY_SCAN:
             state = list_pose(state, results.runs[i], scene.stop)
+        if 8 * (state.sizes[LISTED] * RECORD + state.sizes[CLUSTERS] * CLUSTER) > options.listed:
+            return state
     return state

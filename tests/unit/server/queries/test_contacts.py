@@ -200,11 +200,10 @@ def test_bad_poses_are_refused_as_by_every_question(
 def test_more_than_a_request_may_list_is_refused_before_it_is_kept(
     row: ScanCase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By pairs, and by clusters where no pair is listed; what has gone by then is what one look apart adds."""
+    """By pairs, and by clusters where no pair is listed; what is kept by then is what one pose adds."""
     kept = []
     room = contacts_module._check_room
     monkeypatch.setattr(contacts_module, "_check_room", lambda memory: kept.append(memory) or room(memory))
-    monkeypatch.setattr(contacts_module, "SIZE_VISITS", 64)
     monkeypatch.setattr(contacts_module, "MAX_BYTES", 100_000)
     poses = at(*((0.05 * i, 0.0, 0.0) for i in range(60))).repeat(20, axis=0)
     avatar = make_avatar(row_of_points(8), 0.06)

@@ -83,8 +83,9 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         same(probe, data, first, long)
         spent = make_budget(budget_ms=0)
         assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
-        unseen = data._replace(unknown_everywhere=True)
-        for seen in (unseen, data._replace(unknown=np.array([[[-(10**6)] * 3, [10**6] * 3]]))):
+        unseen, region = data._replace(unknown_everywhere=True), np.array([[[-(10**6)] * 3, [10**6] * 3]])
+        tree = data.tree._replace(unknown=region.astype(np.float64))
+        for seen in (unseen, data._replace(unknown=region, tree=tree)):
             assert {each.verdict for each in same(probe, seen, first, last)} <= {
                 Verdict.UNKNOWN,
                 Verdict.CONTACT,

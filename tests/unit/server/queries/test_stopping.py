@@ -71,7 +71,7 @@ def test_pairs_of_stopped_objects_that_could_touch_are_listed_as_unknown(asked: 
 @pytest.mark.interpreted
 def test_a_stopped_motion_inside_is_not_said_to_leave(asked: Asked) -> None:
     data, ball, pose = asked.data, make_avatar([[0.0, 0, 0]], 0.001), np.eye(4)[None]
-    middle = (data.broad.scene_low + data.broad.scene_high) // 2
+    middle = data.tree.scene.mean(axis=0)
     pose[0, :3, 3] = data.arrays.origin + data.arrays.step * middle
     for stop in (NO_STOP, stopped_already(WHY)):
         found = sweep(with_stop(data, stop), ball, pose, pose, budget=effort_of(stop))

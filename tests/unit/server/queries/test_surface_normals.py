@@ -19,7 +19,7 @@ from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.server.archives.archive_generation import ArchiveGeneration
 from solidcloud.server.archives.masked_store import MaskedStore
 from solidcloud.server.kernels.core.normal_codes import LINE, THICK
-from solidcloud.server.kernels.rays.surface import voxels_in_box
+from solidcloud.server.kernels.rays.surface import voxels_near
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.surface_normals import Normals
 from solidcloud.server.residency.arena import ArenaBuffer
@@ -192,7 +192,7 @@ def border(opened: ArchiveGeneration, points: NDArray[np.float64]) -> tuple[NDAr
     lattice, places, square = lattice_points(opened, points)
     rows = voxels_of(opened, lattice)
     for n, at in enumerate(lattice):
-        low, high = opened.data.broad.low, opened.data.broad.high
+        low, high = opened.data.tree.low[: rows.max() + 1], opened.data.tree.high[: rows.max() + 1]
         near = np.flatnonzero(
             ((low <= at + math.isqrt(square) + 1) & (high >= at - math.isqrt(square) - 1)).all(axis=1)
         )
@@ -246,21 +246,28 @@ def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_p
 
 
 @pytest.mark.parametrize("capacity", [2, 64])
-def test_voxels_in_a_box_are_those_whose_points_may_lie_there(tmp_path: Path, capacity: int) -> None:
+def test_voxels_near_a_point_are_those_whose_points_may_be_within_reach(
+    tmp_path: Path, capacity: int
+) -> None:
     case, rng = build(tmp_path, "noise"), np.random.default_rng(4)
     with asked(case.archive) as (opened, _):
-        header, index = opened.store.archive.header, opened.data.broad
-        held = opened.data.references.to(opened.data.arrays, index)
+        header, tree = opened.store.archive.header, opened.data.tree
+        low, high = (side[: tree.voxels].astype(np.int64) for side in (tree.low, tree.high))
+        held = opened.data.references.to(opened.data.arrays, tree)
         counts = set()
-        for size in (1, 2000, 9000, 30_000, 1 << 40):  # the largest holds more cells than there are voxels
+        for reach in (0, 1000, 9000, 1 << 20):
             for _ in range(20):
-                low = rng.integers(header.low - 9000, header.high + 9000)
-                high, rows = low + rng.integers(0, size, 3), np.full(capacity, -1, np.int64)
-                expected = np.flatnonzero(((index.low <= high) & (index.high >= low)).all(axis=1))
-                assert voxels_in_box(held.reference, low, high, rows) == len(expected)
-                if len(expected) <= capacity:
-                    assert sorted(rows[: len(expected)].tolist()) == expected.tolist()
-                counts.add(len(expected))
+                place, rows = rng.integers(header.low - 9000, header.high + 9000), np.full(capacity, -1)
+                away = (np.maximum(np.maximum(low - place, place - high), 0) ** 2).sum(axis=1)
+                needed = held.call(voxels_near, held.reference, *place.tolist(), reach * reach, rows)
+                # Widened by a step, and by more than the rounding.
+                least, most = ((away <= far * far).sum() for far in (reach, reach + 2))
+                assert least <= needed <= most
+                if needed <= capacity:
+                    found = rows[:needed].tolist()
+                    assert set(np.flatnonzero(away <= reach * reach).tolist()) <= set(found)
+                    assert (np.diff(away[found]) >= 0).all(), "nearest first"
+                counts.add(needed)
     assert {0, 1, 2} < counts
 
 

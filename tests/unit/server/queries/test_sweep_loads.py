@@ -9,7 +9,7 @@ from solidcloud.server.scene import Scene
 
 
 def test_a_motion_asked_alone_from_an_empty_cache_has_the_bits_of_the_last_of_many(tmp_path: Path) -> None:
-    """A turning motion has segments, which begin where a voxel's box is met: a loaded voxel's is smaller."""
+    """A turning motion has segments, which begin where a voxel's box is met."""
     rng = np.random.default_rng(0)
     points, avatar = cloud(rng, "cluster", 300), cloud(rng, "cluster", 50) * 0.3
     poses = archive_cases.near_poses(rng, points, avatar, 40, 0.6)

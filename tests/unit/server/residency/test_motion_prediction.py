@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
-from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.kernels.core.reach import VoxelTree, make_voxel_tree
 from solidcloud.server.residency.motion_prediction import (
     PREFETCH_OPTIONS,
     STALE,
     PredictedVoxels,
     UserTracks,
+    _predict_paths,
 )
 
 STEP, VOXEL_STEPS = 0.01, 200
@@ -20,23 +21,28 @@ REACH = 0.5
 NO_RING = PREFETCH_OPTIONS._replace(ring=0.0)
 
 
-def floor(side: int = 20) -> tuple[SceneIndex, NDArray[np.int64]]:
-    """A floor of 2 m voxels, side by side, each full of points; and their coordinates (v, 3)."""
+def tree_of(low: NDArray[np.int64], high: NDArray[np.int64]) -> VoxelTree:
+    """The tree over the boxes of voxels (v, 3), of which no scan was left out."""
+    bounds = np.stack([low.min(axis=0), high.max(axis=0)])
+    return make_voxel_tree(low, high, bounds, np.empty((0, 2, 3), np.int64))
+
+
+def floor(side: int = 20) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A floor of 2 m voxels, side by side, each full of points: low corners and coordinates (v, 3)."""
     x, y = np.meshgrid(np.arange(-side, side), np.arange(-side, side))
     coordinates = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size, np.int64)])
-    keys = voxel_keys(coordinates)
-    coordinates = coordinates[np.argsort(keys)]
-    low = coordinates * VOXEL_STEPS
-    high = low + VOXEL_STEPS - 1
-    return SceneIndex(np.sort(keys), low, high, low.min(axis=0), high.max(axis=0)), coordinates
+    coordinates = coordinates[np.argsort(voxel_keys(coordinates))]
+    return coordinates * VOXEL_STEPS, coordinates
 
 
-INDEX, COORDINATES = floor()
+LOW, COORDINATES = floor()
+HIGH = LOW + VOXEL_STEPS - 1
+TREE = tree_of(LOW, HIGH)
 
 
 def make(ahead: object = PREFETCH_OPTIONS) -> UserTracks:
     """Nobody there yet."""
-    return UserTracks(INDEX, VOXEL_STEPS, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
+    return UserTracks(TREE, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
 
 
 def at(x: float, y: float) -> tuple[float, float, float]:
@@ -52,7 +58,7 @@ def cells(rows: NDArray[np.int64]) -> set[tuple[int, int]]:
 def touched(x: float, y: float, reach: float) -> set[tuple[int, int]]:
     """Brute force: the voxels a ball at a place of the floor touches."""
     center = np.array([x, y, 1.0]) / STEP
-    gap = np.maximum(np.maximum(INDEX.low - center, center - INDEX.high), 0)
+    gap = np.maximum(np.maximum(LOW - center, center - HIGH), 0)
     return cells(np.flatnonzero(np.sqrt((gap**2).sum(axis=1)) <= reach / STEP))
 
 
@@ -91,7 +97,7 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     assert cells(wanted.rows) == touched(1.9, 1.0, REACH + PREFETCH_OPTIONS.ring)
     here = touched(1.9, 1.0, REACH)
     assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
-    low, high = INDEX.low[wanted.rows] * STEP, INDEX.high[wanted.rows] * STEP
+    low, high = LOW[wanted.rows] * STEP, HIGH[wanted.rows] * STEP
     gap = np.maximum(np.maximum(low - [1.9, 1.0, 1.0], [1.9, 1.0, 1.0] - high), 0)
     beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / PREFETCH_OPTIONS.ring
     expected = PREFETCH_OPTIONS.horizon(0.25) * (1 + beyond[len(here) :])
@@ -179,9 +185,11 @@ def test_who_leaves_is_forgotten() -> None:
 # --- against brute force over all voxels at many moments of the predicted path ---------------------------
 
 
-def gaps(index: SceneIndex, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+def gaps(
+    low: NDArray[np.int64], high: NDArray[np.int64], centers: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Distances (k, v) from places (k, 3) to the boxes of all voxels."""
-    away = np.maximum(np.maximum(index.low - centers[:, None], centers[:, None] - index.high), 0)
+    away = np.maximum(np.maximum(low - centers[:, None], centers[:, None] - high), 0)
     return np.sqrt((away**2).sum(axis=2))
 
 
@@ -191,14 +199,12 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
     """Three users in voxels that are scattered in space, each with a box of points inside it."""
     rng = np.random.default_rng([side, count])
     coordinates = np.unique(rng.integers(-side, side, (count, 3)), axis=0)
-    keys = voxel_keys(coordinates)
-    base = coordinates[np.argsort(keys)] * VOXEL_STEPS
+    base = coordinates[np.argsort(voxel_keys(coordinates))] * VOXEL_STEPS
     ends = np.sort(rng.integers(0, VOXEL_STEPS, (2, len(base), 3)), axis=0)
     low, high = base + ends[0], base + ends[1]
-    index = SceneIndex(np.sort(keys), low, high, low.min(axis=0), high.max(axis=0))
     ahead, met = PREFETCH_OPTIONS._replace(ring=ring, settled=0.0, most_wanted=1000), 0
     for turn in range(20):
-        around = UserTracks(index, VOXEL_STEPS, np.zeros(3), STEP, ahead)
+        around = UserTracks(tree_of(low, high), np.zeros(3), STEP, ahead)
         expected: dict[int, tuple[float, float]] = {}
         for user in range(3):
             speed = rng.normal(0, 1, 3) * (0.0 if turn % 5 == 0 else rng.choice([0.3, 2.0, 8.0]))
@@ -211,10 +217,10 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
         wanted = around.plan(now, 0.25)
         assert len(set(wanted.rows.tolist())) == len(wanted.rows) and (np.diff(wanted.need) >= 0).all()
         wide = reach / STEP + 1.0
-        for path in around._planned_paths[0]:
+        for path in _predict_paths(around._snapshot(), ahead, np.full(3, horizon)) / STEP:
             along = np.linspace(0, 16, 801)
             centers = np.column_stack([np.interp(along, np.arange(17), path[:, k]) for k in range(3)])
-            apart = gaps(index, centers)
+            apart = gaps(low, high, centers)
             # Between moments the ball moves at most half of what it moves from one to the next.
             between = np.linalg.norm(np.diff(centers, axis=0), axis=1).max() / 2
             for row in range(len(low)):
@@ -240,9 +246,9 @@ def test_turning_is_followed() -> None:
     around, angle = make(), np.arange(16) / 30
     for a in angle.tolist():
         around.record_pose(ME, a, at(1.5 * np.cos(a), 1.5 * np.sin(a)), REACH)
-    around.plan(15 / 30, 0.0)
     end, last = angle[-1] + 0.5, angle[-1]
     truth = 1.5 * np.array([np.cos(end), np.sin(end)])
     straight = 1.5 * np.array([np.cos(last), np.sin(last)]) + 0.75 * np.array([-np.sin(last), np.cos(last)])
-    found = around._planned_paths[0][0, -1, :2] * STEP
+    path = _predict_paths(around._snapshot(), PREFETCH_OPTIONS, np.full(1, 0.5))[0]
+    found = (path[-1] - ORIGIN)[:2]
     assert np.linalg.norm(found - truth) < np.linalg.norm(straight - truth) * 0.6

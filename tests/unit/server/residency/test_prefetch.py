@@ -75,13 +75,11 @@ def until(condition: Callable[[], bool]) -> bool:
 
 def test_what_is_wanted_is_loaded_soonest_first_and_counted() -> None:
     table = Table([1] * 5, 5)
-    order: list[int] = []
-    table.residency.on_proved = order.append
     table.wishes.wanted = {3: 0.5, 1: 0.1, 4: 2.0}
     with table.prefetcher:
         table.see()
-        assert until(lambda: len(order) == 3)
-        assert order == [1, 3, 4]
+        assert until(lambda: table.resident() == [1, 3, 4])
+        assert list(table.store.loads) == [1, 3, 4], "in this order"
         with table.residency.hold([1]) as held:
             assert (held.hits, held.misses) == (1, 0)
         counters = table.residency.counters()

@@ -2,16 +2,11 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
-import archive_cases
 import numpy as np
 import pytest
-import synthetic_scans
 from fake_store import BLOCK, FakeStore
-from solidcloud.server.queries.context.query_context import as_held
 from solidcloud.server.residency.voxel_cache import HeldVoxels, VoxelCache
-from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
@@ -134,16 +129,3 @@ def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
             assert hurried or not held.late
     residency.check()
     assert not residency._pins and not residency._loading
-
-
-def test_a_kernel_does_not_see_what_comes_late(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 200), voxel=0.5)
-    with Scene.open(case.archive) as scene:
-        data, rows = scene._data, list(range(scene.info().voxels))
-        with data.residency.hold(rows[:1]), data.residency.hold(rows, 0.0) as held:
-            assert held.late == tuple(rows[1:]) and len(rows) > 2
-            seen = as_held(data, held)
-            with data.residency.hold(rows) as all_of_them:
-                assert (data.arrays.where[:, 0] >= 0).all() and as_held(data, all_of_them) is data
-                assert (seen.arrays.where[rows[1:]] == -1).all() and seen.arrays.where[0, 0] >= 0
-        data.residency.check()

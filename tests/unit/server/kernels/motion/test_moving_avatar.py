@@ -103,5 +103,5 @@ def test_an_avatar_is_turned_once_for_each_orientation_and_step(rng: np.random.G
                 kernel.place_block(avatar, block, moving, scene)
         for name in ("nodes", "lanes", "displacements", "frame"):
             assert getattr(kept, name).tobytes() == getattr(fresh, name).tobytes(), name
-        orientations.append(int(kept.counters[4]))
+        orientations.append(int(kept.counters[3]))
     assert orientations == [1, 1, 2, 3, 4]

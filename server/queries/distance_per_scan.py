@@ -10,9 +10,9 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
 from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
 from .collide import clear_of_rows
-from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
+from .level_of_detail import find_level
 from .resolve import Steps, drop_items, resolve, run
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.

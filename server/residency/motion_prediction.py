@@ -6,7 +6,8 @@ The voxels in a ring around the user's position follow, in case the user turns. 
 pins and evicts nothing, and reads no clock: callers pass `now` in seconds, all from the same clock.
 
 Thread-safe. One lock guards the poses and is held for microseconds. Callers may hold other locks
-when they take it; no lock is taken while it is held.
+when they take it; no lock is taken while it is held. `path_distances` takes no lock: the caller
+that evicts holds its own.
 """
 
 import math
@@ -39,11 +40,14 @@ LEAST_GAP, MAX_POSES = 0.005, 64
 # speeds [m/s] and accelerations [m/s²] of people. The fit relies on them where poses are few or
 # close in time, and needs no special cases.
 SCATTER, USUAL_SPEED, USUAL_ACCELERATION = 0.02, 3.0, 2.0
-# Straight pieces of a predicted path, and how many of them one box encloses.
+# Straight pieces of a predicted path, and how many of them one box of grid cells encloses.
 PIECES, PIECES_OF_BOX = 16, 4
 # A voxel counts as touched when the distance is this much more than the reach [m]; steps of a search
 # for the moment of touching, which needs one a piece and few more.
 GRAZE, MAX_TOUCH_STEPS = 0.001, 3 * PIECES
+# Largest number of grid cells one call looks up: some 0.1 s, reached only with voxels far smaller
+# than the reach or hundreds of fast users. The last cells of each box are then omitted.
+MAX_CELLS = 1 << 19
 # A reach is widened by this share of itself, and by one step: by more than the rounding of the
 # computations with it.
 RELATIVE_SLACK = 1e-6

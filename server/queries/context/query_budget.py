@@ -59,7 +59,7 @@ class QueryBudget(NamedTuple):
     stop: ends the work early once it is set; what was not examined by then is unknown.
     request: the flag of the whole request, which its deadline does not set: for its broad phase.
     late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such
-    voxels are bounded (../resolve.py), their loads are owed, and they are counted here.
+    voxels are bounded (late_voxels.py), their loads are owed, and they are counted here.
     """
 
     tolerance: float = 0.0

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.kernels.core.reach import VoxelTree
+from solidcloud.server.queries.context.query_context import make_tree
 from solidcloud.server.report.load.users.user_traces import Centers
 from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
 
@@ -20,15 +21,13 @@ AT_ONCE = 1000
 class Town(NamedTuple):
     """Data of an archive that a simulation needs.
 
-    index: its voxels, in lattice steps.
-    voxel_steps: edge of a voxel.
+    tree: boxes around the points of its voxels.
     origin (3,), step: of the lattice [m].
     sizes: (v,) int64, bytes of each decoded voxel.
     radius: of its largest sphere [m].
     """
 
-    index: SceneIndex
-    voxel_steps: int
+    tree: VoxelTree
     origin: NDArray[np.float64]
     step: float
     sizes: NDArray[np.int64]
@@ -36,19 +35,13 @@ class Town(NamedTuple):
 
     def user_tracks(self, ahead: PrefetchOptions = PREFETCH_OPTIONS) -> UserTracks:
         """Return a new motion prediction, without any user."""
-        return UserTracks(self.index, self.voxel_steps, self.origin, self.step, ahead)
+        return UserTracks(self.tree, self.origin, self.step, ahead)
 
 
 def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
     """Return the data of an archive whose decoded voxels take `sizes` (v,) bytes."""
-    lattice, voxels = archive.header.lattice, archive.voxels
-    base = archive.coordinates * lattice.voxel_steps
-    index = SceneIndex(
-        voxels["key"].astype(np.uint64), base + voxels["low"], base + voxels["high"], archive.header.low,
-        archive.header.high,
-    )  # fmt: skip
-    origin = np.array(lattice.origin)
-    return Town(index, lattice.voxel_steps, origin, lattice.step, sizes, archive.header.radius)
+    lattice = archive.header.lattice
+    return Town(make_tree(archive), np.array(lattice.origin), lattice.step, sizes, archive.header.radius)
 
 
 class Requests(NamedTuple):
@@ -91,7 +84,7 @@ def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:
     Sweeps are scans in row order, by the user NOBODY.
     """
     voxels, seconds = len(town.sizes), float(asked.time[-1] - asked.time[0])
-    middle = (town.index.low + town.index.high) / 2 * town.step + town.origin
+    middle = (town.tree.low[:voxels] + town.tree.high[:voxels]) / 2 * town.step + town.origin
     begin = asked.time[0] + seconds * (np.arange(sweeps) + 1) / (sweeps + 1)
     time = (begin[:, None] + np.arange(voxels) * SWEEP_SECONDS / voxels).ravel()
     swept = Centers(

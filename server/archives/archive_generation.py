@@ -16,9 +16,9 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
 from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.level_of_detail import open_level_data, with_level
 from ..queries.context.query_context import SceneData, make_scene_data, make_tree, with_radius_model
 from ..queries.engine_table import warm_engines
+from ..queries.level_of_detail import open_level_data, with_level
 from ..residency.eviction import EvictionPolicy, prefetches
 from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks

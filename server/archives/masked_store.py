@@ -71,8 +71,8 @@ class MaskedStore(VoxelStore):
     def _find_voxels(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which voxels (v,) have points in a box, perhaps, and which lie inside one.
 
-        For "inside", the voxel's whole cell counts, because the voxel is never read and a forged index
-        cannot shrink a cell (server/residency/index_proof.py).
+        For "inside", the voxel's whole cell counts: the voxel is never read, so nothing would show that
+        its box in the index is too small.
         """
         voxels, steps = self.archive.voxels, self.archive.header.lattice.voxel_steps
         base = self.archive.coordinates * steps

@@ -13,7 +13,6 @@ from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
-from .context.level_of_detail import below, find_level, level_budget, level_reach
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
@@ -24,6 +23,7 @@ from .context.query_context import (
     to_units,
     with_stop,
 )
+from .level_of_detail import below, find_level, level_budget, level_reach
 from .resolve import Steps, drop_items, load_and_search, resolve, run
 
 

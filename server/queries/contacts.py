@@ -45,10 +45,10 @@ from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import clear_of_rows
-from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
 from .context.signed_distance import signed_from_square
+from .level_of_detail import find_level
 from .resolve import Steps, drop_items, resolve, run
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to

@@ -16,10 +16,10 @@ from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
-from .context.level_of_detail import below, find_level, level_budget, level_reach
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import LevelOfDetail, SceneData, check_request, kernel_poses, to_units, with_stop
 from .context.signed_distance import distance_columns, unknown_gaps
+from .level_of_detail import below, find_level, level_budget, level_reach
 from .resolve import Search, Steps, drop_items, load_and_search, resolve, run
 
 # Rounding of square roots and of placed points in a bound [exact units].

@@ -12,10 +12,10 @@ from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.reach import VoxelLists
 from .collide import clear_of_rows
 from .contacts import MAX_BYTES, MAX_CELLS, empty_memory
-from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
 from .context.signed_distance import signed_from_square
+from .level_of_detail import find_level
 from .resolve import Steps, drop_items, resolve, run
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.

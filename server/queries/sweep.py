@@ -23,9 +23,9 @@ from ..kernels.motion.sweep_segments import (
     plan_segments,
 )
 from ..runtime.stop_flag import StoppedError
-from .context.level_of_detail import below, find_level, level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import LevelOfDetail, SceneData, kernel_poses, refuse, to_units, with_stop
+from .level_of_detail import below, find_level, level_budget
 from .resolve import Steps, drop_items, resolve, run
 
 # `tolerance` of a request that gives none [m].

@@ -129,7 +129,7 @@ def test_a_server_says_what_was_asked_of_it(archive: Path, endpoint: str) -> Non
         assert 0 <= user.silent_seconds < DEADLINE
         known = scene.residency.where[:, 0] >= 0
         with Scene.open(archive, budget_bytes=64 << 20) as other:
-            index = other._data.broad.keys
+            index = other._data.keys
         assert now.keys == sorted(index[known].tolist()) and len(now.keys) == now.resident
         assert now.load_seconds.count == sum(now.load_seconds.buckets) >= now.resident > 0
         assert 0 < now.load_seconds.p50 <= now.load_seconds.p99 <= now.load_seconds.max

@@ -6,48 +6,57 @@ import numpy as np
 from count_within_question import CountWithinAnswers
 from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.kernels.core.reach import MISSING, NOT_HELD, Items, VoxelLists, find_lists
 from solidcloud.server.kernels.core.scene_arrays import LANES, SceneArrays
-from solidcloud.server.queries.context.front_to_back import make_origins
 from solidcloud.server.queries.context.query_budget import EXACT, CostCounter, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, to_units
+from solidcloud.server.queries.nearest_hits import make_origins
+from solidcloud.server.queries.resolve import Steps, resolve, run
 
 
 def count_within(
     data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> CountWithinAnswers:
     """Count the scan points of one archive within `reach` [m] of each of k points (k, 3)."""
-    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    return run(count_within_steps(data, points, reach, budget))
+
+
+def count_within_steps(
+    data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
+) -> Steps[CountWithinAnswers]:
+    """Answer `count_within` in slices."""
+    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
     _, units = make_origins(data, points, "points")
     reach_units, k = to_units(reach, "reach"), len(units)
     scene = data.arrays
     counts, (missing, visits, tests) = np.zeros(k, np.uint32), np.zeros((3, k), np.uint32)
-    exact = np.full(k, not data.nothing_clear)
-    size = scene.voxel_steps * scene.units_per_step
-    for row, cell in enumerate(scene.coordinates):
-        low = cell * size
-        away = np.maximum(np.maximum(low - units, units - (low + size)), 0.0)
-        near = (away * away).sum(axis=1) <= float(reach_units + 1) ** 2
-        if budget.stop:
-            exact &= ~near
-        if budget.stop or not near.any():
-            continue
-        with data.residency.hold([row], budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            if scene.where[row, 0] < 0 or held.late:
-                missing[near] += 1
-            else:
+
+    def search(
+        lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
+    ) -> None:
+        for i in which:
+            while cursor[i] < lists.starts[i + 1] and not budget.stop:
+                row = lists.rows[cursor[i]]
+                if state[row] == NOT_HELD:
+                    break
+                cursor[i] += 1
+                if state[row] == MISSING:
+                    missing[i] += 1
+                    continue
                 stored = _stored_points(scene, row)
-                for i in np.flatnonzero(near):
-                    apart = stored - units[i]
-                    apart = apart[(np.abs(apart) <= reach_units).all(axis=1)]  # their squares fit 63 bits
-                    counts[i] += ((apart * apart).sum(axis=1) <= reach_units * reach_units).sum()
-                    tests[i] += len(stored)
-                    visits[i] += 1
-        spent.add(held)
-    exact &= missing == 0
-    for low, high in data.unknown * scene.units_per_step:
-        exact &= ((units + reach_units < low) | (units - reach_units > high)).any(axis=1)
+                apart = stored - units[i]
+                apart = apart[(np.abs(apart) <= reach_units).all(axis=1)]  # their squares fit 63 bits
+                counts[i] += ((apart * apart).sum(axis=1) <= reach_units * reach_units).sum()
+                tests[i] += len(stored)
+                visits[i] += 1
+
+    at = units / scene.units_per_step
+    span = np.full(k, reach_units / scene.units_per_step + 1.0)  # a step more exceeds what rounding loses
+    lists = find_lists(data.tree, Items(at, at, span, np.zeros(k)), budget.request.flag)
+    left = yield from resolve(data, lists, search, budget, spent)
+    exact = (missing == 0) & (np.minimum(lists.unseen, left) == np.inf) & (not data.nothing_clear)
     verdict = np.where(counts > 0, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))
-    low, high = (np.rint(b * scene.units_per_step) for b in (data.broad.scene_low, data.broad.scene_high))
+    low, high = np.rint(data.tree.scene * scene.units_per_step)
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
     return CountWithinAnswers(
         verdict.astype(np.uint8), counts, exact, outside, missing, visits, tests, **spent.fields()

@@ -59,6 +59,6 @@ def test_page_is_told_that_kernels_are_compiled() -> None:
     link = SceneLink("tcp/127.0.0.1:1")
     reader: Any = Reader([0.0], 0.0)
     link._show(info([MOTION, "sweep"]), reader, reader)
-    assert "2 of 9 parts are left" in link.status.message
+    assert "2 of 8 parts are left" in link.status.message
     link._show(info([]), reader, reader)
     assert link.status.message == ""

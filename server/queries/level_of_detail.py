@@ -13,18 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.archive import Archive
-from ....schemas.archive.level import cover_units, halvings_between
-from ....schemas.archive.voxel_grid import voxel_keys
-from ....schemas.errors import BadRequestError, TooLargeError
-from ...avatars.avatar_model import AvatarModel
-from ...kernels.core.reach import VoxelLists
-from ...kernels.core.voxels_in_reach import VoxelsInReach
-from ...residency.voxel_cache import VoxelCache
-from ...runtime.stop_flag import StoppedError
-from ..resolve import drop_entries
-from .query_budget import QueryBudget
-from .query_context import LevelOfDetail, SceneData, check_request, make_scene_data, with_stop
+from ...schemas.archive.archive import Archive
+from ...schemas.archive.level import cover_units, halvings_between
+from ...schemas.archive.voxel_grid import voxel_keys
+from ...schemas.errors import BadRequestError, TooLargeError
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.reach import VoxelLists
+from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..residency.voxel_cache import VoxelCache
+from ..runtime.stop_flag import StoppedError
+from .context.query_budget import QueryBudget
+from .context.query_context import LevelOfDetail, SceneData, check_request, make_scene_data, with_stop
+from .resolve import drop_entries
 
 
 class LevelData(NamedTuple):

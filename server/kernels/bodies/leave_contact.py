@@ -61,7 +61,7 @@ def gather_points(held, voxel, box, pose, found, count):
     mask = np.uint64(scene.radius_deficit.shape[0] - 1)
     low, shift = np.empty(3, np.int64), np.empty(3)
     for r in range(3):
-        low[r] = scene.coordinates[voxel, r] * scene.voxel_steps
+        low[r] = scene.corners[voxel, r]
         shift[r] = scene.origin[r] - pose[r, 3]
     base = scene.where[voxel, 0]
     rows, depth = np.empty(STACK, np.int64), 1

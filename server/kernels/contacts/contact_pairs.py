@@ -138,7 +138,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         avatar_lanes[1, j] = lanes[block, 1, j] - ly
         avatar_lanes[2, j] = lanes[block, 2, j] - lz
     record, squares = scratch.record, scratch.squares
-    coordinates, counts, pairs = scene.coordinates, results.counts, results.pairs
+    corners, counts, pairs = scene.corners, results.counts, results.pairs
     for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
@@ -162,7 +162,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         if not touched:
             continue
         for r in range(3):
-            low = coordinates[voxel, r] * scene.voxel_steps + np.int64(ints[block_at + r])
+            low = corners[voxel, r] + np.int64(ints[block_at + r])
             record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
         record[0, SCAN] = -1
         if options.with_scan:
@@ -184,7 +184,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
     sizes, most_cells = state.sizes, state.cells.table.shape[0]
     thresholds, mask, flag = scratch.by_class.threshold, scratch.by_class.mask, scene.stop
     for r in range(3):
-        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
+        off[r] = np.float32(scene.corners[voxel, r] - placed.frame[r])
     depth = sizes[DEPTH]
     if depth == 0:
         counts[1, i] += 1

@@ -63,7 +63,7 @@ def refer_to_avatar(avatar):
 def with_flag(scene, stop):
     """Return the arrays of a scene with the stop flag of a request, (1,) int64."""
     return SceneArrays(
-        scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, scene.origin, scene.step,
+        scene.words, scene.ints, scene.halves, scene.where, scene.corners, scene.origin, scene.step,
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
 

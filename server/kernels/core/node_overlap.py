@@ -342,12 +342,12 @@ def sphere_is_near(halves, lane_at, low_x, low_y, low_z, x, y, z, reach):
 @njit_no_refcount
 def locate_voxel(scene, voxel, placed):
     """Locate a resident voxel in the arena and relative to the frame."""
-    coordinates, where, frame = scene.coordinates, scene.where, placed.frame
+    corners, where, frame = scene.corners, scene.where, placed.frame
     return VoxelLocation(
         where[voxel, 0],
         where[voxel, 1],
         where[voxel, 2],
-        np.float32(coordinates[voxel, 0] * scene.voxel_steps - frame[0]),
-        np.float32(coordinates[voxel, 1] * scene.voxel_steps - frame[1]),
-        np.float32(coordinates[voxel, 2] * scene.voxel_steps - frame[2]),
+        np.float32(corners[voxel, 0] - frame[0]),
+        np.float32(corners[voxel, 1] - frame[1]),
+        np.float32(corners[voxel, 2] - frame[2]),
     )

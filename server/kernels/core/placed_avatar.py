@@ -297,7 +297,7 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
         world = place(
             m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
         )
-        low = scene.coordinates[voxel, r] * scene.voxel_steps + np.int64(scene.ints[block_at + r])
+        low = scene.corners[voxel, r] + np.int64(scene.ints[block_at + r])
         steps = low + np.int64(scene.halves[lane_at + r * LANES + j])
         difference = to_units(world) - lattice_to_units(steps, scene.units_per_step)
         if abs(difference) > MAX_REACH_UNITS:

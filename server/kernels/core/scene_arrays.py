@@ -71,7 +71,7 @@ class SceneArrays(NamedTuple):
     words, ints, halves: the arena.
     where: (v, 3) int64, the starts of a voxel's rows, blocks and lanes in the arena; -1: not
     resident.
-    coordinates: (v, 3) int64, voxel coordinates.
+    corners: (v, 3) int64, the low corner of each voxel [steps].  voxel_steps: edge of the largest voxel.
     origin: (3,) float64 [m].  step: [m].
     block_words: words of a block, with or without radius classes.
     radius_deficit: (1,) or (RADIUS_CLASSES,) int64, the largest radius minus the radius of each
@@ -83,7 +83,7 @@ class SceneArrays(NamedTuple):
     ints: NDArray[np.int32]
     halves: NDArray[np.uint16]
     where: NDArray[np.int64]
-    coordinates: NDArray[np.int64]
+    corners: NDArray[np.int64]
     origin: NDArray[np.float64]
     step: float
     units_per_step: float

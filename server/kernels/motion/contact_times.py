@@ -92,7 +92,7 @@ def touches_at(sweep, t, pair):
 @njit_no_refcount
 def scan_coordinate(scene, pair, r):
     """Return lattice coordinate r of a pair's scan point [steps]."""
-    low = scene.coordinates[pair[2], r] * scene.voxel_steps + np.int64(scene.ints[pair[4] + r])
+    low = scene.corners[pair[2], r] + np.int64(scene.ints[pair[4] + r])
     return low + np.int64(scene.halves[pair[3] + r * LANES + pair[5]])
 
 

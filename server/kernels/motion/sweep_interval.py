@@ -208,7 +208,7 @@ def _follows(sweep, chord, voxel, a, row):
     if np.float64(moving.nodes[0, a]) - reach > np.float64(x - moving.frame[0]):
         return True
     for r in range(3):
-        named = scan_coordinate(scene, moving.pair, r) - scene.coordinates[voxel, r] * scene.voxel_steps
+        named = scan_coordinate(scene, moving.pair, r) - scene.corners[voxel, r]
         least = _least(scene.words, row, r)
         if least != np.float64(named):
             return least > np.float64(named)
@@ -229,7 +229,7 @@ def _sweep_voxel(sweep, chord, voxel):
     thresholds, mask = moving.thresholds[0], np.uint64(scene.radius_deficit.shape[0] - 1)
     nodes, off, stack, counters = moving.nodes, moving.off, moving.stack, moving.counters
     for r in range(3):
-        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - moving.frame[r])
+        off[r] = np.float32(scene.corners[voxel, r] - moving.frame[r])
     widest = thresholds[0]  # of the only class, if there is one
     counters[0] += 1
     latest = _latest(moving)

@@ -68,7 +68,7 @@ def sweep_resident(
         first[0, r, 3] -= origin[r]
         last[0, r, 3] -= origin[r]
     from_zero = SceneArrays(
-        scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, one.origin, scene.step,
+        scene.words, scene.ints, scene.halves, scene.where, scene.corners, one.origin, scene.step,
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
     progress.at[0], progress.end[0], progress.lower[0], progress.speed[0] = 0.0, 1.0, 1.0, 0.0

@@ -201,7 +201,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
     shift, frame, step, stop = placed.shift, placed.frame, scene.step, scene.stop
     location = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
     for r in range(3):
-        corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
+        corner[r] = scene.corners[voxel, r]
         off[r] = np.float32(corner[r] - placed.frame[r])
     off_x, off_y, off_z = off[0], off[1], off[2]
     counters[0] += 1

@@ -105,9 +105,9 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     nearest = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32)
     nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * words[U(row) + U(3)] + 1.0)
     far = min(far, np.float32(nearest * nearest * (1.0 + 64.0 * U32)))
-    lx = scene.coordinates[voxel, 0] * scene.voxel_steps + np.int64(ints[block_at])
-    ly = scene.coordinates[voxel, 1] * scene.voxel_steps + np.int64(ints[block_at + 1])
-    lz = scene.coordinates[voxel, 2] * scene.voxel_steps + np.int64(ints[block_at + 2])
+    lx = scene.corners[voxel, 0] + np.int64(ints[block_at])
+    ly = scene.corners[voxel, 1] + np.int64(ints[block_at + 1])
+    lz = scene.corners[voxel, 2] + np.int64(ints[block_at + 2])
     for j in range(ints[block_at + 3]):
         dx = np.float32(halves[at_x + U(j)]) - qx
         dy = np.float32(halves[at_y + U(j)]) - qy
@@ -141,9 +141,9 @@ def _search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, ke
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
-    cx = scene.coordinates[voxel, 0] * scene.voxel_steps
-    cy = scene.coordinates[voxel, 1] * scene.voxel_steps
-    cz = scene.coordinates[voxel, 2] * scene.voxel_steps
+    cx = scene.corners[voxel, 0]
+    cy = scene.corners[voxel, 1]
+    cz = scene.corners[voxel, 2]
     x = np.float64(at_units[i, 0] - lattice_to_units(cx, scene.units_per_step)) * per_unit
     y = np.float64(at_units[i, 1] - lattice_to_units(cy, scene.units_per_step)) * per_unit
     z = np.float64(at_units[i, 2] - lattice_to_units(cz, scene.units_per_step)) * per_unit

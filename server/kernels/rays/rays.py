@@ -172,9 +172,9 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     if not met:
         return
     ux, uy, uz = rays.direction[i, 0], rays.direction[i, 1], rays.direction[i, 2]
-    lx = scene.coordinates[voxel, 0] * scene.voxel_steps + np.int64(ints[block_at])
-    ly = scene.coordinates[voxel, 1] * scene.voxel_steps + np.int64(ints[block_at + 1])
-    lz = scene.coordinates[voxel, 2] * scene.voxel_steps + np.int64(ints[block_at + 2])
+    lx = scene.corners[voxel, 0] + np.int64(ints[block_at])
+    ly = scene.corners[voxel, 1] + np.int64(ints[block_at + 1])
+    lz = scene.corners[voxel, 2] + np.int64(ints[block_at + 2])
     for j in range(ints[block_at + 3]):
         x = np.float32(halves[at_x + U(j)]) - qx
         y = np.float32(halves[at_y + U(j)]) - qy
@@ -251,7 +251,7 @@ def _follow(scene, voxel, rays, i, ray, near, best, rows, bounds, deficits):
     per_unit = 1.0 / scene.units_per_step
     farthest = 0.0
     for r in range(3):
-        corner = scene.coordinates[voxel, r] * scene.voxel_steps
+        corner = scene.corners[voxel, r]
         from_corner = rays.origin[i, r] - lattice_to_units(corner, scene.units_per_step)
         ray[r] = np.float64(from_corner) * per_unit
         farthest = max(farthest, abs(ray[r]), abs(np.float64(corner)))

@@ -89,11 +89,11 @@ def add_near(held, voxels, x, y, z, square, sums, directions, heights):
     directions: (k, 3) float64, unit.  heights: (k,) float64, the greatest height over the point
     along each direction [steps].  The first call gets zeros for sums and heights.
     """
-    scene, rows, steps = held.scene, np.empty(STACK, np.int64), held.scene.voxel_steps
+    scene, rows = held.scene, np.empty(STACK, np.int64)
     for voxel in voxels:
         u, v, w = (
-            x - scene.coordinates[voxel, 0] * steps,
-            y - scene.coordinates[voxel, 1] * steps,
-            z - scene.coordinates[voxel, 2] * steps,
+            x - scene.corners[voxel, 0],
+            y - scene.corners[voxel, 1],
+            z - scene.corners[voxel, 2],
         )
         _add_near(scene, voxel, u, v, w, square, rows, sums, directions, heights)

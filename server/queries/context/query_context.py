@@ -142,7 +142,7 @@ def make_scene_data(archive: Archive, residency: VoxelCache, tree: VoxelTree | N
     arrays = SceneArrays(
         *residency.buffer.arena,
         residency.where,
-        archive.coordinates,
+        archive.coordinates * lattice.voxel_steps,
         np.array(lattice.origin),
         lattice.step,
         lattice.units_per_step,

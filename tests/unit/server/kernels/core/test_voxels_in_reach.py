@@ -62,7 +62,7 @@ def test_no_voxel_in_reach_is_left_out(
         near = (within & ((np.where(within[..., None], apart, 0) ** 2).sum(axis=2) <= most**2)).any(axis=0)
         needed = {tuple(v) for v in voxels[near].tolist()}
         rows = listed(reach, i)
-        found = {tuple(v) for v in data.arrays.coordinates[rows].tolist()}
+        found = {tuple(v) for v in (data.arrays.corners[rows] // lattice.voxel_steps).tolist()}
         assert needed <= found and len(found) == len(rows)
         # And each one listed has its box within reach of the sphere around the avatar.
         center = placed.mean(axis=0)

@@ -71,7 +71,9 @@ def check_cold(looks: Looks, archive: Path, points: Any, body: Any, poses: Any) 
 
     with Scene.open(archive) as scene:
         info = scene.info()
-    judged = naive_distance.distance(points, info.origin, info.lattice_step, info.radius, body, 0.01, poses, 5.0)
+    judged = naive_distance.distance(
+        points, info.origin, info.lattice_step, info.radius, body, 0.01, poses, 5.0
+    )
     signed = np.array([np.inf if each is None else each.signed for each in judged])
     for found in stops(looks, ask):
         judge_distance(found, np.where(signed <= REACH, signed, np.inf), REACH, 0.1, False)

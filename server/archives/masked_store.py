@@ -72,7 +72,7 @@ class MaskedStore(VoxelStore):
         """Return which voxels (v,) have points in a box, perhaps, and which lie inside one.
 
         For "inside", the voxel's whole cell counts, because the voxel is never read and a forged index
-        cannot shrink a cell (server/residency/index_proof.py).
+        cannot shrink a cell.
         """
         voxels, steps = self.archive.voxels, self.archive.header.lattice.voxel_steps
         base = self.archive.coordinates * steps

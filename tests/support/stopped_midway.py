@@ -58,16 +58,16 @@ def stops(looks: Looks, ask: Callable[..., Any]) -> list[Any]:
 
 
 def check_cold(looks: Looks, archive: Path, points: Any, body: Any, poses: Any) -> int:
-    """Stop `distance` with half of the voxels in memory and a level that is asked about the others.
+    """Stop queries with half of the voxels in memory and a level that is asked about the others.
 
-    Compare with brute force. Return the number of distances that are bounded by more than boxes.
+    Compare with brute force. Return the number of distances that are bounded but not exact.
     """
-    bounded = 0
+    bounded, wide = 0, 0.1
 
-    def ask(stop: StopFlag) -> Any:
+    def ask(query: str, length: float, stop: StopFlag) -> Any:
         with Scene.open(archive) as scene, scene.residency.hold(range(0, scene.info().voxels, 2)):
             scene.add_avatar("body", body, 0.01)
-            return scene.distance("body", poses, REACH, tolerance=0.1, stop=stop)
+            return getattr(scene, query)("body", poses, length, tolerance=wide, stop=stop)
 
     with Scene.open(archive) as scene:
         info = scene.info()
@@ -75,9 +75,11 @@ def check_cold(looks: Looks, archive: Path, points: Any, body: Any, poses: Any) 
         points, info.origin, info.lattice_step, info.radius, body, 0.01, poses, 5.0
     )
     signed = np.array([np.inf if each is None else each.signed for each in judged])
-    for found in stops(looks, ask):
-        judge_distance(found, np.where(signed <= REACH, signed, np.inf), REACH, 0.1, False)
+    for found in stops(looks, lambda stop: ask("distance", REACH, stop)):
+        judge_distance(found, np.where(signed <= REACH, signed, np.inf), REACH, wide, False)
         bounded += int((np.isfinite(found.upper) & ~found.exact).sum())
+    for found in stops(looks, lambda stop: ask("collide", MARGIN, stop)):
+        judge_collide(found, signed, MARGIN, wide, False)
     return bounded
 
 

@@ -57,7 +57,8 @@ def distance_steps(
     # A level does not know the radii of a scene with several.
     level = find_level(data, budget) if len(data.arrays.radius_deficit) == 1 else None
 
-    absent_bound = np.zeros(len(array))  # of what absent voxels hold, by the level [steps]
+    # Of what absent voxels hold, by the level; of those that need not be loaded; of the others [steps].
+    absent_bound, settled_bound = np.zeros(len(array)), np.full(len(array), np.inf)
     resident_bound = np.full(len(array), np.inf)
 
     def settle(lists: VoxelLists) -> Steps[VoxelLists]:
@@ -78,7 +79,9 @@ def distance_steps(
             spent,
         )
         units = absent_bound * data.arrays.units_per_step
-        return drop_items(lists, _is_within(nearest, units, around.units, budget))
+        settled = _is_within(nearest, units, around.units, budget)
+        settled_bound[which] = np.where(settled, absent_bound, np.inf)[which]
+        return drop_items(lists, settled)
 
     if len(avatar.points):
         search = _search(
@@ -86,6 +89,7 @@ def distance_steps(
         )
         left = yield from resolve(data, around.lists, search, budget, spent, settle)
         missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
+        missing = np.minimum(missing, settled_bound)
         np.minimum(missing, resident_bound, out=nearest.missing_bound)
         np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(

@@ -62,22 +62,25 @@ def resolve(
 ) -> Steps[NDArray[np.float64]]:
     """Search the voxels in reach of k items; add the cost to `spent`.
 
-    settle: asked about the voxels that are absent; None: load them all.  together: the voxels of an
-    item are searched in one call where they fit in the cache together, instead of those that are
-    resident first.
+    settle: asked about the voxels that are absent, unless the request was stopped before; None: load
+    them all.  together: the voxels of an item are searched in one call where they fit in the cache
+    together, instead of those that are resident first.
     Return (k,) float64 [steps], the least `near` of the voxels that were not searched, because the
     budget was spent or the request was stopped; inf for items that are finished.
     """
     absent = data.arrays.where[lists.rows[: lists.starts[-1]], 0] < 0
     if settle is None or not absent.any():
         return (yield from load_and_search(data, lists, search, budget, spent, together=together))
-    if together:
+    if together and not budget.stop:
         cold = yield from settle(drop_entries(lists, ~absent))
         settled = np.diff(cold.starts) == 0
         lists = drop_entries(lists, absent & settled[items_of(lists)])
+    if together:
         return (yield from load_and_search(data, lists, search, budget, spent, together=True))
     left = yield from load_and_search(data, drop_entries(lists, absent), search, budget, spent)
-    lists = yield from settle(drop_entries(lists, ~absent))
+    lists = drop_entries(lists, ~absent)
+    if not budget.stop:  # all that is resident has been searched
+        lists = yield from settle(lists)
     return np.minimum(left, (yield from load_and_search(data, lists, search, budget, spent)))
 
 

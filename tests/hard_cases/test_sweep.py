@@ -189,8 +189,7 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
             return load(row, *rest)
 
         data.residency._store.load = broken  # type: ignore[method-assign]
-        for row in np.flatnonzero(data.residency.where[:, 0] >= 0).tolist():
-            data.residency._evict(row)
+        assert not data.residency.resident
         # Past it within reach: its points are at x 2 to 2.4.
         beside = judged_sweeps.ask(data, POINT, 0.01, at(-1, 0.2, 0.6), at(4, 0.2, 0.6), margin=0.3)
         through = judged_sweeps.ask(data, POINT, 0.01, at(1, 0.2, 0.2), at(4, 0.2, 0.2), margin=0.3)
@@ -199,8 +198,9 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
         apart = judged_sweeps.ask(data, POINT, 0.01, at(-1, -0.2, 0.2), at(1.0, -0.2, 0.2))
     assert beside.verdict[0] == Verdict.CONTACT
     assert through.verdict[0] == Verdict.UNKNOWN and through.voxels_missing[0] >= 1 and through.faults
-    # Points begin within 0.1 m of x = 2, their cell, within which they may be anywhere, at 1.5.
-    assert 0.05 < through.lower[0] <= (1.5 + 0.1 - 0.32 - 1) / 3
+    # Their box says where points begin.
+    met = (points[40:, 0].min() - 0.32 - 1) / 3
+    assert met - 1e-3 < through.lower[0] <= met + 1e-4
     assert before.verdict[0] == Verdict.CONTACT and before.exact[0] and before.upper[0] < 0.3
     assert after.verdict[0] == Verdict.CONTACT and not after.exact[0]
     assert after.lower[0] <= (4 - 2.3 - 0.32) / 5 < after.upper[0]
@@ -213,7 +213,8 @@ def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
     box = np.array([[[2.0, -1, -1], [3.0, 1, 1]]])
     with judged_sweeps.opened(case) as data:
         steps = np.rint((box - data.arrays.origin) / data.arrays.step).astype(np.int64)
-        partly = data._replace(unknown=steps)
+        tree = data.tree._replace(unknown=steps.astype(np.float64))
+        partly = data._replace(unknown=steps, tree=tree)
         nowhere = data._replace(unknown_everywhere=True)
         reached = (
             judged_sweeps.ask(partly, POINT, 0.5, at(6.0, 1.5), at(1.0, 1.5)),

@@ -97,7 +97,7 @@ def test_what_a_level_settles_is_true(
             assert said(kept.contacts("avatar", poses, 5, margin, radius_model=model)) == said(counted)
 
 
-def test_motions_towards_a_dense_wall_need_no_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_motions_beside_a_dense_wall_need_no_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
     wall = rng.uniform(0, 1, (6000, 3)) * [2.0, 0.003, 2.0]
     body = rng.uniform(-0.1, 0.1, (200, 3))
     case = archive_cases.build(tmp_path, wall, radius=0.15, voxel=1.0)
@@ -107,11 +107,11 @@ def test_motions_towards_a_dense_wall_need_no_voxel(tmp_path: Path, rng: np.rand
     with Scene.open(case.archive) as scene:
         scene.add_avatar("body", body, 0.002)
         far = scene.sweep("body", begin, beside, tolerance=0.1)
-        into = scene.sweep("body", begin, end, tolerance=0.2)
         clear = scene.contacts("body", beside, tolerance=0.1)
-        assert far.misses == into.misses == clear.misses == scene.residency.resident == 0
+        assert far.misses == clear.misses == scene.residency.resident == 0
+        into = scene.sweep("body", begin, end, tolerance=0.2)
+        assert into.misses > 0, "a level proves motions clear alone"
         exact = scene.sweep("body", begin, end)
-        assert exact.misses > 0
     assert (far.verdict == Verdict.CLEAR).all() and (clear.verdict == Verdict.CLEAR).all()
     assert clear.exact.all() and far.exact.all()
     assert (into.verdict == Verdict.CONTACT).all() and into.exact.all()

@@ -39,9 +39,10 @@ class Looks:
         self.made, self.at, self.stop = 0, 0, StopFlag()
 
     def __call__(self, flag: Any) -> bool:
-        self.made += 1
-        if self.made == self.at:
-            self.stop.set("")
+        if flag is self.stop.flag:  # the prediction of users looks at another
+            self.made += 1
+            if self.made == self.at:
+                self.stop.set("")
         return bool(flag[0] != 0)
 
 
@@ -54,6 +55,32 @@ def stops(looks: Looks, ask: Callable[..., Any]) -> list[Any]:
         found.append(ask(stop=looks.stop))
         assert looks.stop and found[-1].stopped == ""
     return found
+
+
+def check_cold(looks: Looks, archive: Path, points: Any, body: Any, poses: Any) -> int:
+    """Stop queries with half of the voxels in memory and a level that is asked about the others.
+
+    Compare with brute force. Return the number of distances that are bounded but not exact.
+    """
+    bounded, wide = 0, 0.1
+
+    def ask(query: str, length: float, stop: StopFlag) -> Any:
+        with Scene.open(archive) as scene, scene.residency.hold(range(0, scene.info().voxels, 2)):
+            scene.add_avatar("body", body, 0.01)
+            return getattr(scene, query)("body", poses, length, tolerance=wide, stop=stop)
+
+    with Scene.open(archive) as scene:
+        info = scene.info()
+    judged = naive_distance.distance(
+        points, info.origin, info.lattice_step, info.radius, body, 0.01, poses, 5.0
+    )
+    signed = np.array([np.inf if each is None else each.signed for each in judged])
+    for found in stops(looks, lambda stop: ask("distance", REACH, stop)):
+        judge_distance(found, np.where(signed <= REACH, signed, np.inf), REACH, wide, False)
+        bounded += int((np.isfinite(found.upper) & ~found.exact).sum())
+    for found in stops(looks, lambda stop: ask("collide", MARGIN, stop)):
+        judge_collide(found, signed, MARGIN, wide, False)
+    return bounded
 
 
 def check_body(looks: Looks, scene: Scene, points: Any, body: Any, poses: Any) -> int:
@@ -110,10 +137,13 @@ def check(archive: Path) -> None:
             module.stopped = looks
     for front in (2, avatar_model.MAX_FRONT):
         with Scene.open(archive) as scene, mock.patch.object(avatar_model, "MAX_FRONT", front):
+            with scene.residency.hold(range(scene.info().voxels)):
+                pass
             scene.add_avatar("body", body, 0.01)
             partial += check_body(looks, scene, points, body, poses)
             if front > 2:
                 check_others(looks, scene, poses)
+    assert check_cold(looks, archive, points, body, poses)
     assert partial, "no distance was stopped midway with bounds from its stack"
 
 

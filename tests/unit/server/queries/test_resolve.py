@@ -226,6 +226,24 @@ def test_settle_is_asked_about_absent_voxels_alone(together: bool) -> None:
     assert len(asked) == 1, "all of them are resident"
 
 
+@pytest.mark.parametrize("together", [False, True])
+def test_settle_is_not_asked_after_a_stop(together: bool) -> None:
+    """It may rely on every resident voxel having been searched, and an answer is due."""
+    table = Table([1] * 4, 4)
+    table.load(0, 1)
+    table.stop_at = 1
+    if together:
+        table.stop.set("")
+
+    def settle(_: VoxelLists) -> Steps[VoxelLists]:
+        raise AssertionError("asked after a stop")
+        yield
+
+    lists, budget = lists_of([[0, 1, 2], [3]]), QueryBudget(stop=table.stop)
+    left = run(resolve(table.data, lists, table.search, budget, table.spent, settle, together=together))
+    assert left.tolist() == [0.5 if together else 1.5, 0.5] and not table.store.loads
+
+
 def test_entries_and_items_are_dropped() -> None:
     lists = lists_of([[5, 6], [], [7, 8, 9]])
     assert drop_entries(lists, np.zeros(5, bool)) is lists

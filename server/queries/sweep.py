@@ -155,7 +155,9 @@ def sweep_steps(
         return _answers(progress, proved, counts, outside, tolerance)
     box, scratch = avatar_box(avatar.arrays), make_scratch(avatar.arrays)
     spent = CostCounter(begin, data.residency, data.keys)
-    level = find_level(data, budget)
+    # The default tolerance is the rounding of an interval: such a sweep is an exact request.
+    level = find_level(data, budget if tolerance > DEFAULT_TOLERANCE else budget._replace(tolerance=0.0))
+    settled: NDArray[np.bool_] = np.zeros(k, bool)
 
     arrays = with_stop(data, budget.stop).arrays
 
@@ -173,7 +175,8 @@ def sweep_steps(
         progress.floor[which] = yield from _clear_until(
             own, avatar, world[0][which], world[1][which], margin, tolerance, budget, spent
         )
-        return drop_items(lists, progress.floor >= progress.end)
+        settled[which] = progress.floor[which] >= progress.end[which]
+        return drop_items(lists, settled)
 
     which = np.arange(k)
     if part is not None:
@@ -185,7 +188,19 @@ def sweep_steps(
         if part is not None:
             lists = below(part.level, lists, part.rows)
         progress.lower[which] = progress.end[which]
+        settled[:], missing = False, counts[0].copy()
         left = yield from resolve(data, lists, search, budget, spent, settle, together=True)
+        # What else is near decides in which interval a contact is found: then the voxels that the
+        # level settled are needed too, because the answer must not depend on what was in memory.
+        again = settled & (left == np.inf) & ((progress.upper < np.inf) | (progress.lower < progress.end))
+        if again.any():
+            found = progress.upper.copy()
+            progress.lower[again], progress.upper[again] = progress.end[again], np.inf
+            counts[0, again] = missing[again]
+            lists = drop_items(lists, ~again)
+            left = np.minimum(left, (yield from resolve(data, lists, search, budget, spent, together=True)))
+            lost = np.isinf(progress.upper) & (left < np.inf)  # stopped before it was found again
+            progress.upper[lost] = found[lost]
         unfinished = left < np.inf
         progress.lower[unfinished] = np.minimum(progress.lower, progress.at)[unfinished]
         which = _next_round(which, progress, proved)
@@ -194,14 +209,16 @@ def sweep_steps(
     # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
-    lost = np.empty(k)
-    find_unknown_regions(box, first, last, avatar.arrays, units, data.arrays, data.tree, until, outside, lost)
+    unknown = np.empty(k)
+    find_unknown_regions(
+        box, first, last, avatar.arrays, units, data.arrays, data.tree, until, outside, unknown
+    )
     if data.nothing_clear:
-        lost[:] = 0.0
-    met = lost <= until
-    proved[met] = np.minimum(proved, lost)[met]
+        unknown[:] = 0.0
+    met = unknown <= until
+    proved[met] = np.minimum(proved, unknown)[met]
     if part is None and ((proved < 1.0).any() or (progress.upper < np.inf).any()):
-        budget.lacked(len(spent.late))  # what else is near decides in which interval a contact is found
+        budget.lacked(len(spent.late))
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(answers, **spent.fields())

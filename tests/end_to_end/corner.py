@@ -140,11 +140,12 @@ def same(one, other):
 def opened(folder):
     """Open the corner as a scene, built below `folder`.
 
-    It has its own avatars and those of the client "plain".
+    It has its own avatars and those of the client "plain". It has no level of detail: with one, costs
+    depend on what is in memory.
     """
     with radius_class_archives.any_classes():
         case = archive_cases.build(folder, POINTS, models=radius_class_archives.STORED)
-    with Scene.open(case.archive, "hall") as scene:
+    with Scene.open(case.archive, "hall", level_bytes=0) as scene:
         add_avatars(scene)
         add_avatars(scene, client="plain")
         yield scene

@@ -23,7 +23,6 @@ def test_a_server_answers_collide_while_the_rest_compiles(endpoint):
         assert client.info().compiling == client.stats().compiling == list(PARTS[1:])
         for part, ask in {
             "distance": lambda: client.distance("al", PATH),
-            "collide and budgets|budgets": lambda: client.collide("al", PATH, budget_ms=5.0),
             "sweep": lambda: list(client.path("al", PATH, "sweep")),
             "motion": lambda: client.move("al", PATH[0], PATH[1], 0.1),
         }.items():

@@ -71,8 +71,8 @@ class MaskedStore(VoxelStore):
     def _find_voxels(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which voxels (v,) have points in a box, perhaps, and which lie inside one.
 
-        For "inside", the voxel's whole cell counts, because the voxel is never read and a forged index
-        cannot shrink a cell.
+        For "inside", the voxel's whole cell counts: the voxel is never read, so nothing would show that
+        its box in the index is too small.
         """
         voxels, steps = self.archive.voxels, self.archive.header.lattice.voxel_steps
         base = self.archive.coordinates * steps
@@ -84,10 +84,10 @@ class MaskedStore(VoxelStore):
 
     def _meets_box(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which lattice boxes, low and high (n, 3) each, may have points in a box."""
-        low, high = self._world_boxes(low, high)
+        world_low, world_high = self._world_boxes(low, high)
         found = np.zeros(len(low), bool)
         for least, greatest in self._boxes:
-            found |= ((low <= greatest) & (high >= least)).all(axis=1)
+            found |= ((world_low <= greatest) & (world_high >= least)).all(axis=1)
         return found
 
     def _world_boxes(
@@ -170,7 +170,7 @@ class MaskedStore(VoxelStore):
         _remove_nodes(arena, where, blocks[:, 3])
 
 
-def _remove_nodes(arena: Arena, where: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
+def _remove_nodes(arena: Arena, where: NDArray[np.int64], counts: NDArray[np.int32]) -> None:
     """Write the numbers of points (b,) of a voxel's blocks into its nodes; move empty nodes far away."""
     ints, words = (view[where[0] : where[1]].reshape(-1, ROW_WORDS) for view in (arena.ints, arena.words))
     leaves = np.flatnonzero(ints[:, FIRST] < 0)

@@ -98,17 +98,21 @@ def load_and_search(
     cursor, ends = lists.starts[:-1].copy(), lists.starts[1:]
     state: NDArray[np.uint8] = np.zeros(len(where), np.uint8)
     looked: NDArray[np.bool_] = np.zeros(len(where), bool)
+    first = True
     while len(open_ := np.flatnonzero(cursor < ends)) and not budget.stop:
         if together:
             open_, rows = _whole_items(data, lists, cursor, open_)
         else:
-            rows = _next_rows(data, lists, cursor, open_)
+            needed = (
+                lists.rows[: lists.starts[-1]] if first else lists.rows[_entries(lists, cursor, open_)[0]]
+            )
+            rows = _next_rows(data, lists.rows[cursor[open_]], needed)
         with residency.hold(rows.tolist(), budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             state[rows] = np.where(where[rows, 0] < 0, MISSING, HELD)
             state[list(held.late)] = MISSING  # another thread may be loading them
             search(lists, open_, cursor, state)
         spent.add(held, int(looked[rows].sum()))
-        state[rows], looked[rows] = NOT_HELD, True
+        state[rows], looked[rows], first = NOT_HELD, True, False
         yield
     left = np.full(len(cursor), np.inf)
     open_ = np.flatnonzero(cursor < ends)
@@ -116,18 +120,16 @@ def load_and_search(
     return left
 
 
-def _next_rows(
-    data: SceneData, lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _next_rows(data: SceneData, ahead: NDArray[np.int64], needed: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the distinct voxels to hold in the next round, at least one.
 
-    First come the next voxels of the open items, in the order of the items, then resident ones that
-    some item needs later. Those that do not fit in the cache together are left for another round.
+    First come those `ahead`, the next ones of the open items, in the order of the items, then
+    resident ones of those that some item still needs. Those that do not fit in the cache together
+    are left for another round.
     """
-    where = data.arrays.where
-    ahead = _distinct(lists.rows[cursor[open_]])
+    where, ahead = data.arrays.where, _distinct(ahead)
     later: NDArray[np.bool_] = np.zeros(len(where), bool)
-    later[lists.rows[_entries(lists, cursor, open_)[0]]] = True
+    later[needed] = True
     later &= where[:, 0] >= 0
     later[ahead] = False
     return _that_fit(data, np.concatenate([ahead, np.flatnonzero(later)]))

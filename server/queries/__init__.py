@@ -2,5 +2,5 @@
 
 May import server.avatars, server.kernels, server.queries.context, server.residency, server.runtime,
 schemas.
-Begin with collide.py.
+Begin with resolve.py, then collide.py.
 """

@@ -87,10 +87,12 @@ def test_dial_changes_node_visits_and_bounds(browser: Any, url: str) -> None:
             before, after = at_zero["answers"][question], dialled["answers"][question]
             assert before["exact"]["visits"] == before["tolerant"]["visits"] > 0
             assert after["exact"]["visits"] == before["exact"]["visits"]
-            assert after["tolerant"]["visits"] < after["exact"]["visits"]
+            saved = after["exact"]["visits"] - after["tolerant"]["visits"]
+            # One pose in memory is answered by one kernel call, whose distance is exact.
+            assert saved > 0 if question == "collide" else saved == 0
         exact, tolerant = (dialled["answers"]["distance"][kind] for kind in ("exact", "tolerant"))
         assert exact["sure"] and exact["lower"] == exact["upper"]
-        assert tolerant["lower"] <= exact["lower"] <= tolerant["upper"] <= tolerant["lower"] + 0.1 + 1e-9
+        assert tolerant["lower"] == exact["lower"] == tolerant["upper"]
         table = viewed.page.inner_text("#instrument-openAccuracy table")
         assert "within 10.0 cm" in table and f"{exact['visits']:,}" in table
         viewed.check_clean(url)

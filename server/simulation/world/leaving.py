@@ -204,7 +204,7 @@ class LeavingPose:
         return translated(self.pose, fraction * (to[:3, 3] - self.pose[:3, 3]))
 
 
-def _meets(box: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:
+def _meets(box: NDArray[np.int64], low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which of the boxes low, high (k, 3) meet a box (2, 3)."""
     return ((low <= box[1]) & (high >= box[0])).all(axis=1)
 

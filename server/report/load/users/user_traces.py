@@ -228,7 +228,7 @@ def centers(trace: Trace, avatar: AvatarModel, margin: float = 0.0) -> Centers:
     """
     local = np.append(avatar.arrays.center[0], 1.0)
     center = trace.pose[:, :3] @ local
-    reach = avatar.arrays.radius[0] + avatar.radius + margin
+    reach = np.full(len(center), avatar.arrays.radius[0] + avatar.radius + margin)
     return Centers(trace.user, trace.time, center, reach, jumps(trace.user, trace.time, center))
 
 

@@ -160,3 +160,17 @@ def test_a_level_that_claims_less_than_it_covers_is_a_fault(tmp_path: Path) -> N
     assert verify_archive(folder).faults == ()
     faults = verify_archive(folder, deep=True).faults
     assert faults and all("is not the level of the archive's points" in fault for fault in faults)
+
+
+def test_points_outside_their_voxel_are_faults_and_no_indices(tmp_path: Path) -> None:
+    """With bounds checked, making the level of such points would raise IndexError."""
+    folder = archive_cases.build(tmp_path, scan("noise"), voxel=4.0).archive
+
+    def change(columns: Columns) -> None:
+        rows = read_rows(folder, columns, 0, 2)
+        rows["xyz"] = np.iinfo(np.uint16).max
+        put_rows(folder, columns, 0, 2, rows)
+
+    forge(folder, change)
+    faults = verify_archive(folder, deep=True).faults
+    assert faults and "outside its cell" in faults[0]

@@ -66,7 +66,8 @@ def boxed_scene(
     low, high = inside + coordinates * steps
     arrays = SceneArrays(
         np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.uint16), np.full((6, 3), -1, np.int64),
-        coordinates * steps, np.array(origin), step, step * UNITS, steps, 4, np.zeros(1, np.int64), np.zeros(1, np.int64),
+        coordinates * steps, np.array(origin), step, step * UNITS, steps, 4, np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
     )  # fmt: skip
     bounds = np.stack([low.min(axis=0), high.max(axis=0)])
     return arrays, make_voxel_tree(low, high, bounds, np.stack([low, high], axis=1)[4:])

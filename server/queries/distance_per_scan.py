@@ -81,9 +81,7 @@ def separation_per_scan(
     exact = left[0] == np.inf and missing == 0
     exact &= not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     cells = memory.cells.table[: memory.sizes[CELLS]]
+    numbers = np.where(cells[:, PLACE] < scans, cells[:, PLACE], ANY_SCAN)
     gaps = signed_from_square(cells[:, SQUARE], reach.units[0] - margin_units - cells[:, DEFICIT])
-    separations: dict[int, float] = {}
-    for number, gap in zip(cells[:, PLACE].tolist(), gaps.tolist(), strict=True):
-        number = number if number < scans else ANY_SCAN
-        separations[number] = min(gap, separations.get(number, np.inf))
+    separations = {n: float(gaps[numbers == n].min()) for n in np.unique(numbers).tolist()}
     return ScanSeparations(separations, bool(exact), visits, tests)

@@ -5,10 +5,10 @@ A query lists the voxels in reach of each of its items (poses, points, rays, mot
 that are resident. What these leave open, the query may settle in another way, for example by the
 level of detail (level_of_detail.py). The rest is loaded: `load_and_search` repeats a round until
 every item is finished. A round holds the next voxel of each item, and all later ones that are
-resident, as many as fit in the cache, and calls the search, which goes on where each item stopped.
-A hit in the first voxel therefore loads no second one. A query whose items need their voxels
-together, because it cannot compare parts of an answer exactly (sweep) or collects one item at a time
-(contacts), holds all voxels of as many whole items as fit.
+resident, as many as fit in SHARE of the cache, and calls the search, which goes on where each item
+stopped. A hit in the first voxel therefore loads no second one. A query whose items need their
+voxels together, because it cannot compare parts of an answer exactly (sweep) or collects one item at
+a time (contacts), holds all voxels of as many whole items as fit.
 
 Between two rounds the generator yields, holding nothing. Whoever runs it decides what happens there:
 `run` goes on at once.
@@ -28,6 +28,8 @@ from .context.query_budget import CostCounter, QueryBudget
 from .context.query_context import SceneData
 
 _A = TypeVar("_A")
+# Share of the cache that a round holds at once: the rest stays with the voxels kept for users.
+SHARE = 0.5
 
 # What a query is: it yields between two slices of its work, and returns its answers.
 Steps = Generator[None, None, _A]
@@ -138,16 +140,18 @@ def _next_rows(data: SceneData, ahead: NDArray[np.int64], needed: NDArray[np.int
 def _whole_items(
     data: SceneData, lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first open items whose voxels fit in the cache together, and these distinct voxels.
+    """Return the first open items whose voxels fit in SHARE of the cache, and these distinct voxels.
 
-    The voxels of a single item may not fit: then as many as do.
+    A single item may take the whole cache. Where that does not suffice, its first voxels do.
     """
     entries, ends = _entries(lists, cursor, open_)
     listed = lists.rows[entries]
     rows = _that_fit(data, _distinct(listed))
     left_out = np.flatnonzero(~np.isin(listed, rows))
     whole = len(open_) if not len(left_out) else int(np.searchsorted(ends, left_out[0], side="right"))
-    return open_[: max(1, whole)], rows
+    if whole:
+        return open_[:whole], rows
+    return open_[:1], _that_fit(data, _distinct(listed[: ends[0]]), 1.0)
 
 
 def _entries(
@@ -164,9 +168,10 @@ def _distinct(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[np.sort(np.unique(rows, return_index=True)[1])]
 
 
-def _that_fit(data: SceneData, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the first rows that fit in the cache together, at least one."""
-    residency, capacity = data.residency, data.residency.buffer.total_bytes
+def _that_fit(data: SceneData, rows: NDArray[np.int64], share: float = SHARE) -> NDArray[np.int64]:
+    """Return the first rows that fit together in a share of the cache, at least one."""
+    residency = data.residency
+    capacity = share * residency.buffer.total_bytes
     if residency.bytes_of(rows.tolist()) <= capacity:
         return rows
     taken = np.cumsum([residency.bytes_of([row]) for row in rows.tolist()])

@@ -71,5 +71,5 @@ def _stored_points(scene: SceneArrays, row: int) -> NDArray[np.int64]:
     lanes = scene.halves[lane_at : lane_at + leaves * 3 * LANES].reshape(leaves, 3, LANES)
     places = blocks[:, :3, None].astype(np.int64) + lanes
     there = np.arange(LANES) < blocks[:, 3:4]
-    lattice = np.moveaxis(places, 1, 2)[there] + scene.coordinates[row] * scene.voxel_steps
+    lattice = np.moveaxis(places, 1, 2)[there] + scene.corners[row]
     return np.rint(lattice * scene.units_per_step).astype(np.int64)

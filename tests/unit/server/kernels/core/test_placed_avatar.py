@@ -27,11 +27,10 @@ class Lattice(NamedTuple):
 
     ints: NDArray[np.int32]
     halves: NDArray[np.uint16]
-    coordinates: NDArray[np.int64]
+    corners: NDArray[np.int64]
     origin: NDArray[np.float64]
     step: float
     units_per_step: float
-    voxel_steps: int
 
 
 def lattice(seed: int = 1) -> Lattice:
@@ -39,8 +38,8 @@ def lattice(seed: int = 1) -> Lattice:
     rng = np.random.default_rng(seed)
     return Lattice(
         rng.integers(0, 500, 9).astype(np.int32), rng.integers(0, 400, 9 * LANES).astype(np.uint16),
-        np.array([[0, 0, 0], [-3, 2, 7], [40, -60, 5]]), np.array([7.0, -50.0, 300.0]), STEP, UNITS_PER_STEP,
-        VOXEL_STEPS,
+        np.array([[0, 0, 0], [-3, 2, 7], [40, -60, 5]]) * VOXEL_STEPS, np.array([7.0, -50.0, 300.0]), STEP,
+        UNITS_PER_STEP,
     )  # fmt: skip
 
 
@@ -87,7 +86,7 @@ def scan_point(scene: Lattice, voxel: int, j: int) -> list[int]:
     return [
         round(
             (
-                int(scene.coordinates[voxel, r]) * VOXEL_STEPS
+                int(scene.corners[voxel, r])
                 + int(scene.ints[3 * voxel + r])
                 + int(scene.halves[(3 * voxel + r) * LANES + j])
             )

@@ -1,10 +1,11 @@
-"""Fast path of queries of one pose whose voxels are all resident: a single kernel call.
+"""Fast path of queries of one pose that resident voxels answer: a single kernel call.
 
 The answers equal those of the engines bit for bit, cost counters included, except engine_seconds;
 with a tolerance, that of `distance` is the exact one.
 The engine is called instead if
 
-- a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
+- a voxel has to be loaded, or more than MAX_FAST_VOXELS are in reach. For `collide` and `distance`,
+resident voxels suffice if nothing in the others changes the answer,
 - the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds
 MAX_FAST_REACH,
 - a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).

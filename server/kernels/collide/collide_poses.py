@@ -47,7 +47,7 @@ from ..core.placed_avatar import (
     place_lanes,
     place_root,
 )
-from ..core.reach import MISSING, NOT_HELD, all_resident, state_of
+from ..core.reach import MISSING, NOT_HELD, resident_front, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -258,26 +258,28 @@ def _collide_poses(
 
 @nb.njit(nogil=True, cache=True)
 def collide_resident(pose, body, radius, other_units, tolerance, held, stop, verdict, counts):
-    """Answer `collide` for one pose in one call, where all voxels in its reach are resident.
+    """Answer `collide` for one pose in one call, where the resident voxels suffice.
+
+    They do if all voxels in reach are resident, or if those before the first absent one hold a contact.
 
     pose: (1, 4, 4).  body, held: references to the arrays of the avatar and the scene
     (array_references.py).  stop: (1,) int64, the request's stop flag.
     This is `find_reach`, then `collide_poses`. Writes held.one, the voxels in reach, and verdict (1,)
     and counts (3, 1) as `collide_poses` does.
-    Returns (fault, value found), as `check_poses` does, and the number of rows. -1 rows: not
-    answered, because a voxel has to be loaded, the rows do not fit, or the request was
-    stopped.
+    Returns (fault, value found), as `check_poses` does, and the number of voxels examined. -1: not
+    answered, because a voxel has to be loaded, the rows do not fit, or the request was stopped.
     """
     avatar, scene, one, reach = body.avatar, with_flag(held.scene, stop), held.one, held.one.reach
     verdict[0], counts[0, 0], counts[1, 0], counts[2, 0] = CLEAR, np.uint32(0), np.uint32(0), np.uint32(0)
     fault, _, found, needed = find_reach(pose, avatar, radius, other_units, scene, held.tree, reach)
-    if fault != VALID or not all_resident(scene.where, reach.lists.rows, needed):
+    front = resident_front(scene.where, reach.lists.rows, needed)
+    if fault != VALID or front < 0:
         return fault, found, -1
     if needed > 0:
-        one.cursor[0] = 0
+        one.cursor[0], reach.lists.starts[1] = 0, front
         collide_poses(
             pose, avatar, scene, reach, one.which, one.cursor, held.one.all_held, tolerance, verdict, counts,
         )  # fmt: skip
-        if one.cursor[0] < needed:
+        if one.cursor[0] < front or (front < needed and verdict[0] == CLEAR):
             return fault, found, -1
-    return fault, found, needed
+    return fault, found, front

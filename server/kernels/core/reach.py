@@ -119,14 +119,20 @@ def state_of(state, voxel):
 
 
 @njit_no_refcount
+def resident_front(where, rows, needed):
+    """Return how many voxels at the front of a list of `needed` rows are resident; -1 if it was not written."""
+    if needed < 0 or needed > rows.shape[0]:
+        return -1
+    at = 0
+    while at < needed and where[rows[at], 0] >= 0:
+        at += 1
+    return at
+
+
+@njit_no_refcount
 def all_resident(where, rows, needed):
     """Return whether a list of `needed` rows was written, and all of its voxels are resident."""
-    if needed < 0 or needed > rows.shape[0]:
-        return False
-    resident = True
-    for at in range(needed):
-        resident &= where[rows[at], 0] >= 0
-    return resident
+    return needed >= 0 and resident_front(where, rows, needed) == needed
 
 
 @njit_inlined

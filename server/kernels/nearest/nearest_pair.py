@@ -142,12 +142,18 @@ def set_cut(cut, far, frame, deficit, units):
 
 
 @njit_no_refcount
-def found_units(found):
-    """Return an upper bound of |a - b| + deficit of the pair found, exact units.
+def pair_units(square, deficit):
+    """Return an upper bound of |a - b| + deficit of a pair, exact units.
 
     A bound at this value excludes no pair that ties.
     """
-    return np.int64(math.sqrt(np.float64(found[0]))) + 2 + found[7]
+    return np.int64(math.sqrt(np.float64(square))) + 2 + deficit
+
+
+@njit_no_refcount
+def found_units(found):
+    """Return `pair_units` of the pair found."""
+    return pair_units(found[0], found[7])
 
 
 @njit_no_refcount

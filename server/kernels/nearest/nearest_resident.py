@@ -1,6 +1,7 @@
 """Resident path of `distance`: one pose in one kernel call (`resident_fast_path.py`).
 
-It applies where all voxels in the pose's reach are resident. The kernel also converts the nearest
+It applies where the resident voxels suffice: all in the pose's reach, or all that can hold a pair
+nearer than the one found. The kernel also converts the nearest
 pair to metres, with the formulas of `signed_distance.py` in the same order of operations; the bits
 are therefore the same. As numpy operations on columns of one element, this took four times as long
 as the search.
@@ -15,11 +16,11 @@ from ....schemas.kernels import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units
-from ..core.reach import all_resident
+from ..core.reach import resident_front
 from ..core.scene_arrays import stopped
 from ..core.voxels_in_reach import VALID, find_reach
 from .nearest_pair import NearestPairs
-from .nearest_search import nearest_poses
+from .nearest_search import nearest_poses, nothing_nearer
 
 # Columns of the output.
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
@@ -57,27 +58,29 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
     Writes held.one, the voxels in reach, and result (COLUMNS,) float64: signed distance and its lower
     bound [m], normal, witness of the avatar, witness of the cloud, world [m]; inf and NaN where no
     pair is within reach.
-    Returns (fault, value found), as `check_poses` does, then the number of rows, node visits, point
-    tests. -1 rows: not answered, because a voxel has to be loaded, the rows do not fit, or the request
-    was stopped.
+    Returns (fault, value found), as `check_poses` does, then the number of voxels examined, node visits,
+    point tests. -1 voxels: not answered, because a voxel has to be loaded, the rows do not fit, or the
+    request was stopped.
     """
     avatar, scene, around = body.avatar, with_flag(held.scene, stop), held.one.reach
     fault, _, found, needed = find_reach(
         pose, avatar, radius, radius_units + reach_units, scene, held.tree, around
     )
-    if fault != VALID or not all_resident(scene.where, around.lists.rows, needed):
+    lists = around.lists
+    front = resident_front(scene.where, lists.rows, needed)
+    if fault != VALID or front < 0:
         return fault, found, -1, 0, 0
     nearest = NearestPairs(
         np.full(1, -1, np.int64), np.zeros((1, 6), np.int64), np.zeros(1, np.int64), np.full(1, np.inf)
     )
     counts, cursor = np.zeros((3, 1), np.uint32), held.one.cursor
-    cursor[0] = 0
+    cursor[0], lists.starts[1] = 0, front
     if needed > 0:
         nearest_poses(
             pose, avatar, scene, around, held.one.which, cursor, held.one.all_held, reach_units, 0.0, 0.0,
             nearest, counts,
         )  # fmt: skip
-        if stopped(stop):
+        if stopped(stop) or (front < needed and not nothing_nearer(nearest, 0, lists.near[front], scene)):
             return fault, found, -1, 0, 0
     _write_result(
         nearest.square[0],
@@ -88,4 +91,4 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
         scene,
         result,
     )
-    return fault, found, needed, np.int64(counts[1, 0]), np.int64(counts[2, 0])
+    return fault, found, front, np.int64(counts[1, 0]), np.int64(counts[2, 0])

@@ -57,6 +57,7 @@ from .nearest_pair import (
     found_units,
     lower_bound,
     make_best_pair,
+    pair_units,
     set_cut,
     settle_candidates,
     take_candidates,
@@ -373,6 +374,13 @@ def nearest_poses(
 
 
 @njit_no_refcount
+def nothing_nearer(nearest, i, near, scene):
+    """Return whether no voxel `near` steps away or farther has a nearer pair for pose i, or one that ties."""
+    square = nearest.square[i]
+    return square >= 0 and near * scene.units_per_step > pair_units(square, nearest.deficit[i])
+
+
+@njit_no_refcount
 def _nearest_poses(
     poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, scratch, gaps,
     classes,
@@ -415,7 +423,6 @@ def _nearest_poses(
         nearest.deficit[i] = best.found[7]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])
-        # No voxel farther than the pair found holds a nearer pair, or one that ties.
-        if last < end and best.found[0] >= 0 and near[last] * scene.units_per_step > found_units(best.found):
+        if last < end and nothing_nearer(nearest, i, near[last], scene):
             last = end
         cursor[i] = last

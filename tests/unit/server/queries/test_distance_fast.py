@@ -43,12 +43,16 @@ def test_what_is_resident_is_answered_in_one_call_and_counted_as_used(
     with Scene.open(case.archive) as scene:
         first = distance_fast(scene._data, BALL, above(0.5, 0.3), 0.5)
         assert left.count == 1 and first.misses > 0, "it has to be loaded"
+        assert scene.residency.resident == 1, "nothing in the next voxel is as near"
+        near = distance_fast(scene._data, BALL, above(0.5, 0.3), 0.5)
+        assert left.count == 1 and (near.hits, near.misses) == (1, 0)
         with scene.residency.hold(range(4)):
             pass
         before = scene.residency.stats.hits
         again = distance_fast(scene._data, BALL, above(0.5, 0.3), 0.5)
         assert left.count == 1 and again.misses == 0 and again.hits == 2, "two voxels are in reach"
         assert again.signed_distance.tolist() == pytest.approx([0.19], abs=1e-6)
+        assert near.signed_distance.tolist() == again.signed_distance.tolist()
         assert again.witness_cloud[0].tolist() == pytest.approx([0.5, 0, 0], abs=1e-3)
         assert scene.residency.stats.hits == before + again.hits
         scene.residency.check()

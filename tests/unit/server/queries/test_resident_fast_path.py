@@ -11,6 +11,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import resident_fast_path as module
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT, make_budget
 from solidcloud.server.queries.context.query_context import SceneData
@@ -104,3 +105,22 @@ def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator
             np.testing.assert_allclose(pose, naive_sweep.pose_at(one, other, fraction), atol=1e-12)
         pose, _ = probe.between(np.array([1e6, 0, 0]), one, other, 0.0)
         np.testing.assert_allclose(pose, one, atol=1e-9)
+
+
+@pytest.mark.interpreted
+def test_a_contact_in_the_first_voxels_needs_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = np.column_stack([np.arange(0.05, 4, 0.1), np.zeros(40), np.zeros(40)])
+    case = archive_cases.build(tmp_path, points, voxel=1.0, resolution=1e-3)
+    avatar = make_avatar([[0.0, 0, 0], [0.45, 0, 0]], 0.1)
+    touching, clear = (archive_cases.pose_of(np.eye(3), np.array([0.75, 0, z])) for z in (0.0, 0.3))
+    with judged_sweeps.opened(case) as data:
+        asked = collide(data, avatar, touching)
+        assert asked.verdict[0] == Verdict.CONTACT and asked.misses == 1
+        monkeypatch.setattr(module, "collide", None)
+        again = module.collide_fast(data, avatar, touching)
+        assert again.verdict[0] == Verdict.CONTACT and (again.hits, again.misses) == (1, 0)
+        assert again.node_visits[0] == asked.node_visits[0]
+        with pytest.raises(TypeError):  # not answered by the first voxel alone
+            module.collide_fast(data, avatar, clear, margin=0.1)

@@ -39,18 +39,20 @@ def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path)
     case = archive_cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)
     places = [(0.5, 0, 0), (1.5, 0, 0), (1.0, 5.0, 0)]
     poses = np.array([archive_cases.pose_of(np.eye(3), np.array(place)) for place in places])
-    with Scene.open(case.archive, level_bytes=0) as scene:  # no level of detail, which would know
+    over = QueryBudget(deadline=0.0)  # the time for loads is up, that for searching is not
+    with Scene.open(case.archive, level_bytes=0) as fresh:  # no level of detail, which would know
+        fresh.add_avatar("ball", np.zeros((1, 3)), 0.1)
+        near = distance(fresh._data, fresh.avatar("ball", ""), poses, 1.0, over)
+        assert not near.exact[:2].any() and near.exact[2] and (near.lower[:2] <= 0.39).all()
+        assert ((near.verdict == CLEAR) == (near.lower > 0)).all() and near.verdict[2] == CLEAR
+    with Scene.open(case.archive, level_bytes=0) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.1)
         data, model = scene._data, scene.avatar("ball", "")
-        over = QueryBudget(deadline=0.0)  # the time for loads is up, that for searching is not
         answers = collide(data, model, poses, 0.4, over)
         assert answers.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR]
         # Named, for they are being loaded now: who asks again may find them.
         assert answers.voxels_missing.tolist() == [1, 1, 0]
         assert sorted(answers.late) == data.keys.tolist()
-        near = distance(data, model, poses, 1.0, over)
-        assert not near.exact[:2].any() and near.exact[2] and (near.lower[:2] <= 0.39).all()
-        assert ((near.verdict == CLEAR) == (near.lower > 0)).all() and near.verdict[2] == CLEAR
         later = scene.collide("ball", poses, 0.4, budget_ms=1e9)
         assert later.verdict.tolist() == [CONTACT, CONTACT, CLEAR] and later.stopped == ""
         again = scene.collide("ball", poses, 0.4, budget_ms=0)

@@ -1,4 +1,4 @@
-"""What `raycast` and `within` share: origins, the voxels in reach, and verdicts."""
+"""Provide what `raycast` and `within` share: origins, the voxels in reach, and verdicts."""
 
 import math
 from collections.abc import Callable

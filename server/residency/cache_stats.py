@@ -1,4 +1,4 @@
-"""What a voxel cache reports: counts, the times of loads, and changes for those who follow it.
+"""Report on a voxel cache: counts, the times of loads, and changes for those who follow it.
 
 `VoxelCache` updates all of it under its lock.
 """

@@ -48,7 +48,7 @@ class VoxelTree(NamedTuple):
 
 
 class Items(NamedTuple):
-    """What k items reach, in the frame of the dataset's origin [steps].
+    """Hold what k items reach, in the frame of the dataset's origin [steps].
 
     begin, end: (k, 3), equal for an item that stands still.
     span: (k,) radius of the ball, or half the edge of the moving cube.

@@ -1,4 +1,4 @@
-"""What every query reads: the data of a scene, checked poses, and the voxels in reach."""
+"""Prepare what every query reads: the data of a scene, checked poses, and the voxels in reach."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

@@ -33,6 +33,9 @@ COUNT = 150 if INTERPRETED else 1500
 REACH = 0.4 if INTERPRETED else 0.15
 COARSE = 0.56  # of codes [degrees]
 UP = np.array([0.0, 0.0, 1.0])
+KINDS = ["plane", "corner", "noise", "duplicates", "one point"]
+if not INTERPRETED:  # of so few points, those of the pillar have no surface within reach
+    KINDS.append("pillar")
 
 
 @contextmanager
@@ -77,7 +80,7 @@ def voxels_of(opened: ArchiveGeneration, lattice: NDArray[np.int64]) -> NDArray[
     return np.array([rows[tuple(v)] for v in (lattice // steps).tolist()])
 
 
-@pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates", "one point"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_normals_are_those_of_numpy(tmp_path: Path, kind: str) -> None:
     case = build(tmp_path, kind)
     found = none = across = 0
@@ -104,8 +107,7 @@ def test_normals_are_those_of_numpy(tmp_path: Path, kind: str) -> None:
             assert abs((normal**2).sum() - 1) < 1e-15 and normal[2] >= 0
             found += 1
             across += len(set(rows[((lattice - lattice[n]) ** 2).sum(axis=1) <= square])) > 1
-    # Interpreted, there are few points, and those of the pillar have no surface within reach.
-    assert found > 10 or kind in ("duplicates", "one point") or (INTERPRETED and kind == "pillar")
+    assert found > 10 or kind in ("duplicates", "one point")
     assert none > 10 or kind in ("plane", "corner", "pillar", "one point")
     assert across > 10 or kind in ("duplicates", "one point"), "points of several voxels"
 

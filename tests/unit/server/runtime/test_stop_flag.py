@@ -133,7 +133,6 @@ def test_a_stopped_frame_leaves_the_avatar_where_it_was(scene: Scene) -> None:
     assert moved.left == pytest.approx(np.linalg.norm(end[:3, 3] - begin[:3, 3]))
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_part_of_a_path_that_takes_too_long_ends_alone(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, threads: int

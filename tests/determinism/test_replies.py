@@ -35,7 +35,9 @@ def test_threads_change_no_byte(archive: Path) -> None:
         whole = int(scene.residency.bytes_of(range(len(opened.voxels))))
     first = mixed_requests.checksums(archive, asked, 1, 1 << 26)
     assert len(first) == count
-    told = [reply for reply, (op, _) in zip(first, asked[1:], strict=True) if op not in ("collide", "objects")]
+    told = [
+        reply for reply, (op, _) in zip(first, asked[1:], strict=True) if op not in ("collide", "objects")
+    ]
     assert len(set(told)) > len(told) * 0.8  # verdicts alone have few values
     for threads, budget in ((2, 1 << 26), (4, whole // 2)):
         found = mixed_requests.checksums(archive, asked, threads, budget)

@@ -13,10 +13,9 @@ from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_
 from ...archives.masked_store import MaskedStore
 from ...archives.rigid_transform import transform_boxes
 from ...archives.scene_info import run_order
-from ...scenes.scene_archives import (
+from ...scene_archives import (
     FoundArchive,
     FoundAvatar,
-    ReadPoints,
     error_location,
     find_archives,
     read_avatars,
@@ -43,7 +42,7 @@ class Checked(NamedTuple):
     notes: list[str]
 
 
-def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Checked:
+def check_scene_file(path: Path) -> Checked:
     """Read a scene file and everything it names.
 
     Raises the same errors as `Scene.open`, except those about budgets, and CorruptError or OSError
@@ -52,7 +51,7 @@ def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Check
     file = read_scene(path)
     name = scene_name(file, path)
     archives = find_archives(file, path)
-    avatars = read_avatars(file, path, read_points)
+    avatars = read_avatars(file, path)
     left_out = _removed_points(file, path, archives)
     return Checked(path, name, file, archives, avatars, left_out, list(_notes(file, archives, left_out)))
 

@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -143,9 +143,9 @@ class Scene(QueryMethods):
             raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
         file = read_scene(path)
         name = name or scene_name(file, path)
-        found = find_archives(file, path)
-        avatars = {each.info.name: each.shape for each in read_avatars(file, path)}
         with ExitStack() as stack:
+            found = find_archives(file, path, stack)
+            avatars = {each.info.name: each.shape for each in read_avatars(file, path)}
             archives = open_archives(
                 file, path, name, found, budget_bytes, policy, metrics.loaded, level_bytes
             )
@@ -168,10 +168,9 @@ class Scene(QueryMethods):
     def __repr__(self) -> str:
         """Return the name, the size and the avatars in one line."""
         try:
-            with ExitStack() as stack:
-                each = [stack.enter_context(archive.take()).store.archive for archive in self.archives]
-                points = sum(archive.header.points for archive in each)
-                voxels = sum(len(archive.voxels) for archive in each)
+            with self._taken() as each:
+                points = sum(opened.store.archive.header.points for opened in each)
+                voxels = sum(len(opened.store.archive.voxels) for opened in each)
         except BadRequestError:
             return f"<Scene {self.name!r}: closed>"
         size = f"{points:,} points in {voxels:,} voxels" + (
@@ -217,6 +216,12 @@ class Scene(QueryMethods):
             self.name, before, after, sum(a.points for a in each), time.perf_counter() - begin
         )
 
+    @contextmanager
+    def _taken(self) -> Iterator[list[ArchiveGeneration]]:
+        """Return the current generation of each archive, for a `with`."""
+        with ExitStack() as stack:
+            yield [stack.enter_context(archive.take()) for archive in self.archives]
+
     @property
     def _data(self) -> SceneData:
         """Return the scene data of the first archive, with the default radius model."""
@@ -247,8 +252,7 @@ class Scene(QueryMethods):
 
     def stats(self, keys: bool = False) -> StatsAnswer:
         """Return statistics of cache, requests and waits. keys: also list the resident voxels."""
-        with ExitStack() as stack:
-            each = [stack.enter_context(archive.take()) for archive in self.archives]
+        with self._taken() as each:
             found = make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
         effects = [] if self._simulation is None else self._simulation.effect_stats()
         return structs.replace(found, effects=effects)
@@ -260,16 +264,14 @@ class Scene(QueryMethods):
         points.
         """
         request = OverviewRequest(limit)
-        with ExitStack() as stack:
-            opened = [stack.enter_context(archive.take()).store for archive in self.archives]
-            return read_overview(request, self.archives, opened)
+        with self._taken() as each:
+            return read_overview(request, self.archives, [opened.store for opened in each])
 
     def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
         """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`."""
         request = voxels_request(place, reach, limit)
-        with ExitStack() as stack:
-            opened = [stack.enter_context(archive.take()) for archive in self.archives]
-            return list_voxels(request, self.archives, opened)
+        with self._taken() as each:
+            return list_voxels(request, self.archives, each)
 
     def residency_changes(self) -> ResidencyWatch:
         """Return the changes of what is resident from now on, for a `with`; see `ResidencyChanges`."""

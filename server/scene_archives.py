@@ -34,16 +34,10 @@ MAX_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
 
 class FoundArchive(NamedTuple):
-    """Archive that a scene file names, described before it is opened.
+    """Archive that a scene file names. store: opened.  info: its description."""
 
-    info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
-    keeps_scan: whether it stores the scan of each point.
-    """
-
-    folder: Path
+    store: VoxelStore
     info: SceneInfo
-    sizes: NDArray[np.int64]
-    keeps_scan: bool
 
 
 class FoundAvatar(NamedTuple):
@@ -59,26 +53,22 @@ def is_scene_file(path: Path) -> bool:
     return path.suffix == SUFFIX and not path.is_dir()
 
 
-def find_archives(file: SceneFile, path: Path) -> list[FoundArchive]:
-    """Return the archives that a scene file names, after checking their indexes.
+def find_archives(file: SceneFile, path: Path, stack: ExitStack) -> list[FoundArchive]:
+    """Open the archives that a scene file names; check that each stores what the scene file requires.
 
-    Also checks that each archive stores what the scene file requires.
-    path: of the scene file, for errors and for relative paths.
-    Raises FormatError, CorruptError or BadRequestError.
+    path: of the scene file, for errors and for relative paths.  stack: closes the archives.
+    Raise FormatError, CorruptError or BadRequestError.
     """
     found = []
     for number, item in enumerate(file.archives):
         with error_location(path, f"$.archives[{number}].path"):
-            store = VoxelStore(_resolve_relative(path, item.path))
-        try:
-            header = store.archive.header
-            if file.radius_model is not None:
-                with error_location(path, f"$.radius_model: {store.archive.folder}"):
-                    class_radii(file.radius_model, header.radius, header.models)
-            info = describe(store, store.archive.folder.name)
-            found.append(FoundArchive(store.archive.folder, info, store.sizes, header.scan_index))
-        finally:
-            store.close()
+            store = store_opener(file, number)(_resolve_relative(path, item.path))
+        stack.callback(store.close)
+        header = store.archive.header
+        if file.radius_model is not None:
+            with error_location(path, f"$.radius_model: {store.archive.folder}"):
+                class_radii(file.radius_model, header.radius, header.models)
+        found.append(FoundArchive(store, describe(store, store.archive.folder.name)))
     _check_noise(file, path, found)
     return found
 
@@ -149,25 +139,26 @@ def open_archives(
     took: Callable[[float], None],
     level_bytes: int | None = None,
 ) -> list[PlacedArchive]:
-    """Open the archives of a scene, which the caller closes.
+    """Place the archives of a scene, which the caller closes.
 
-    name: of the scene.  budget_bytes: limit of decoded voxels, all archives together.
+    name: of the scene.  found: by `find_archives`.  budget_bytes: limit of decoded voxels, all archives together.
     policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
     [s].  level_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """
     with error_location(path, "$.archives"):
-        budgets = share_budget(budget_bytes, [each.sizes for each in found])
+        budgets = share_budget(budget_bytes, [each.store.sizes for each in found])
     opened: list[PlacedArchive] = []
     with ExitStack() as stack:
         for number, (each, budget, item) in enumerate(zip(found, budgets, file.archives, strict=True)):
             with error_location(path, f"$.archives[{number}]"):
                 archive = PlacedArchive(
-                    each.folder,
+                    each.store.archive.folder,
                     name,
                     budget_bytes=budget,
                     policy=policy,
                     open_store=store_opener(file, number),
+                    store=each.store,
                     radius_model=file.radius_model,
                     pose=item.pose,
                     took=took,

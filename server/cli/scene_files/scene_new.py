@@ -4,7 +4,7 @@ import errno
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -100,18 +100,19 @@ def _find_spawn(file: SceneFile, out: Path, name: str) -> tuple[Sequence[float] 
 
     Without avatars, a generated figure takes their place.
     """
-    found = find_archives(file, out)
-    given = {each.info.name: each.shape for each in read_avatars(file, out)}
-    who = ", ".join(given)
-    if not given:
-        given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"
-    try:
-        archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
-        with Scene(archives, name) as scene:
-            spawn = find_spawn(scene, add_body(scene, given))
-    except SolidcloudError as error:
-        words = "".join(each if each.isprintable() else " " for each in str(error))
-        return None, f"No place to stand could be searched: {words}."
+    with ExitStack() as stack:
+        found = find_archives(file, out, stack)
+        given = {each.info.name: each.shape for each in read_avatars(file, out)}
+        who = ", ".join(given)
+        if not given:
+            given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"
+        try:
+            archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
+            with Scene(archives, name) as scene:
+                spawn = find_spawn(scene, add_body(scene, given))
+        except SolidcloudError as error:
+            words = "".join(each if each.isprintable() else " " for each in str(error))
+            return None, f"No place to stand could be searched: {words}."
     if spawn is None:
         return None, f"No place near the middle was found where {who} would stand clear on a floor."
     return spawn, f"Tried when this file was written: {who} clear, {CLEARANCE:g} m above a floor."

@@ -3,56 +3,68 @@
 import os
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from msgspec import structs
 from numpy.typing import ArrayLike
 
+from ..schemas.archive.pose_arrays import make_poses
 from ..schemas.errors import BadRequestError, CorruptError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
+from ..schemas.wire.answers import Cost, Part
 from ..schemas.wire.key_expressions import User, check_name
 from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, checked_late
 from ..schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
-from ..schemas.wire.requests import AddAvatarRequest, make_positions
+from ..schemas.wire.question_rules import Question
+from ..schemas.wire.requests import AddAvatarRequest, make_objects, make_positions, make_vectors
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..schemas.wire.warming_parts import MOTION, PARTS
+from .archives.archive_generation import ArchiveGeneration
+from .archives.ask_archives import PathParts, PlacedItems, PlaceItems, ask_along, ask_each, make_legs
+from .archives.merge_answers import limit_pairs
 from .archives.placed_archive import PlacedArchive
+from .archives.residency_watch import ResidencyWatch
 from .archives.scene_info import describe_scene, join_infos, make_stats
-from .avatars.avatar_model import describe_avatar
+from .avatars.avatar_model import AvatarModel, describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
-from .avatars.client_avatars import check_owner
+from .avatars.client_avatars import Avatars, check_owner
 from .observability.request_stats import RequestStats
-from .queries.context.query_context import SceneData
+from .queries.engine_table import ENGINES
+from .queries.objects import SCENE_GROUP
+from .queries.path import PATH_THREADS, largest_part, path_parts
+from .queries.request import EXACT, QueryBudget, make_budget, unknown_answers
+from .queries.scene_data import SceneData, with_stop
 from .residency.voxel_cache import VoxelCache
 from .residency.voxel_store import OpenStore, VoxelStore
+from .runtime.path_threads import PathThreads
 from .runtime.process_heap import give_back_freed_memory
-from .runtime.stop_flag import NO_STOP, StopFlag
-from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, list_avatars
-from .scenes.residency_watch import ResidencyWatch
-from .scenes.scene_archives import (
-    ReadPoints,
+from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
+from .scene_archives import (
     error_location,
     find_archives,
     is_scene_file,
     open_archives,
     read_avatars,
 )
-from .scenes.scene_questions import SceneQuestions
+from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, QueryMethods, list_avatars
 from .simulation.local_session import LocalSession
 from .simulation.simulation import Simulation, make_simulation
 from .tiles.scene_overview import read_overview
 from .tiles.voxel_list import list_voxels
 from .tiles.voxel_tile import read_tile
 
+_A = TypeVar("_A", bound=Cost)
+
 DEFAULT_BUDGET = 512 << 20
 
 
-class Scene(SceneQuestions):
+class Scene(QueryMethods):
     """One or more placed archives, queried as one. Thread-safe; a context manager.
 
     name: name of the scene for clients. Until `reload`, answers are those of the archives' content
@@ -76,7 +88,11 @@ class Scene(SceneQuestions):
         """
         if not archives:
             raise BadRequestError(f"{name}: a scene without archives: expected at least one")
-        super().__init__(archives, name, RequestStats() if metrics is None else metrics)
+        self.name, self.archives = name, list(archives)
+        # A single archive at the identity takes the arguments of a request unchanged.
+        self._alone = self.archives[0] if len(archives) == 1 and archives[0].pose is None else None
+        self._metrics, self._avatars = RequestStats() if metrics is None else metrics, Avatars()
+        self._path_threads = PathThreads(name, max(PATH_THREADS, os.cpu_count() or 1))
         self._file = scene_of(name) if file is None else file
         self._simulation: Simulation | None = None
         self._making = threading.Lock()
@@ -94,7 +110,6 @@ class Scene(SceneQuestions):
         policy: str = "lru",
         open_store: OpenStore | None = None,
         radius_model: str | None = None,
-        read_points: ReadPoints | None = None,
         level_bytes: int | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
@@ -106,56 +121,38 @@ class Scene(SceneQuestions):
         radius_model: default radius model, see schemas/archive/radius_model.py; None: the archive's
         single radius. `open_store` and `radius_model` are refused for a scene file, which declares
         them itself.
-        read_points: returns the points (n, 3) of an avatar's file [m]; None: files are read as by
-        `add_avatar`.
         level_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
         tolerance before voxels are loaded; None: a sixteenth, 0: none.
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
         """
-        path = Path(path)
-        if is_scene_file(path):
-            if open_store is not None or radius_model is not None:
-                raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points, level_bytes)
-        metrics = RequestStats()
-        archive = PlacedArchive(
-            path,
-            name,
-            budget_bytes=budget_bytes,
-            policy=policy,
-            open_store=open_store or VoxelStore,
-            radius_model=radius_model,
-            took=metrics.loaded,
-            level_bytes=level_bytes,
-        )
-        return cls([archive], archive.name, metrics)
-
-    @classmethod
-    def _open_file(
-        cls,
-        path: Path,
-        name: str | None,
-        budget_bytes: int,
-        policy: str,
-        read_points: ReadPoints | None,
-        level_bytes: int | None,
-    ) -> "Scene":
-        """Open a scene file; see `open`. Errors name the file and the place in it."""
+        path, metrics = Path(path), RequestStats()
+        if not is_scene_file(path):
+            archive = PlacedArchive(
+                path,
+                name,
+                budget_bytes=budget_bytes,
+                policy=policy,
+                open_store=open_store or VoxelStore,
+                radius_model=radius_model,
+                took=metrics.loaded,
+                level_bytes=level_bytes,
+            )
+            return cls([archive], archive.name, metrics)
+        if open_store is not None or radius_model is not None:
+            raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
         file = read_scene(path)
         name = name or scene_name(file, path)
-        found = find_archives(file, path)
-        avatars = read_avatars(file, path, read_points)
-        own = {each.info.name: each.shape for each in avatars}
-        metrics = RequestStats()
         with ExitStack() as stack:
+            found = find_archives(file, path, stack)
+            avatars = {each.info.name: each.shape for each in read_avatars(file, path)}
             archives = open_archives(
                 file, path, name, found, budget_bytes, policy, metrics.loaded, level_bytes
             )
             for archive in archives:
                 stack.callback(archive.close)
             with error_location(path, "$.effects"):
-                scene = cls(archives, name, metrics, file, own)
+                scene = cls(archives, name, metrics, file, avatars)
                 scene._simulation = make_simulation(scene, file)
             stack.pop_all()
         return scene
@@ -171,10 +168,9 @@ class Scene(SceneQuestions):
     def __repr__(self) -> str:
         """Return the name, the size and the avatars in one line."""
         try:
-            with ExitStack() as stack:
-                each = [stack.enter_context(archive.take()).store.archive for archive in self.archives]
-                points = sum(archive.header.points for archive in each)
-                voxels = sum(len(archive.voxels) for archive in each)
+            with self._taken() as each:
+                points = sum(opened.store.archive.header.points for opened in each)
+                voxels = sum(len(opened.store.archive.voxels) for opened in each)
         except BadRequestError:
             return f"<Scene {self.name!r}: closed>"
         size = f"{points:,} points in {voxels:,} voxels" + (
@@ -220,6 +216,12 @@ class Scene(SceneQuestions):
             self.name, before, after, sum(a.points for a in each), time.perf_counter() - begin
         )
 
+    @contextmanager
+    def _taken(self) -> Iterator[list[ArchiveGeneration]]:
+        """Return the current generation of each archive, for a `with`."""
+        with ExitStack() as stack:
+            yield [stack.enter_context(archive.take()) for archive in self.archives]
+
     @property
     def _data(self) -> SceneData:
         """Return the scene data of the first archive, with the default radius model."""
@@ -250,8 +252,7 @@ class Scene(SceneQuestions):
 
     def stats(self, keys: bool = False) -> StatsAnswer:
         """Return statistics of cache, requests and waits. keys: also list the resident voxels."""
-        with ExitStack() as stack:
-            each = [stack.enter_context(archive.take()) for archive in self.archives]
+        with self._taken() as each:
             found = make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
         effects = [] if self._simulation is None else self._simulation.effect_stats()
         return structs.replace(found, effects=effects)
@@ -263,16 +264,14 @@ class Scene(SceneQuestions):
         points.
         """
         request = OverviewRequest(limit)
-        with ExitStack() as stack:
-            opened = [stack.enter_context(archive.take()).store for archive in self.archives]
-            return read_overview(request, self.archives, opened)
+        with self._taken() as each:
+            return read_overview(request, self.archives, [opened.store for opened in each])
 
     def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
         """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`."""
         request = voxels_request(place, reach, limit)
-        with ExitStack() as stack:
-            opened = [stack.enter_context(archive.take()) for archive in self.archives]
-            return list_voxels(request, self.archives, opened)
+        with self._taken() as each:
+            return list_voxels(request, self.archives, each)
 
     def residency_changes(self) -> ResidencyWatch:
         """Return the changes of what is resident from now on, for a `with`; see `ResidencyChanges`."""
@@ -291,7 +290,8 @@ class Scene(SceneQuestions):
         placed = self.archives[request.archive]
         with placed.take() as opened:
             try:
-                return read_tile(request, placed, opened.store, opened.level_archive)
+                coarse = opened.level.store.archive if opened.level else None
+                return read_tile(request, placed, opened.store, coarse)
             except OSError as error:
                 raise CorruptError(
                     f"voxel {request.voxel}: cannot be read ({error}): check the disk"
@@ -346,6 +346,154 @@ class Scene(SceneQuestions):
         request = AddAvatarRequest(name, make_positions(shape.points), shape.radius, shape.inner_points)
         model = self._avatars.add(name, request.points, request.radius, client, request.inner_points)
         return describe_avatar(name, model, shape.description)
+
+    def avatar(self, name: str, client: str) -> AvatarModel:
+        """Return an avatar of the client or of the scene. Raise UnknownAvatarError."""
+        return self._avatars.get(name, client)
+
+    def ask(self, question: Question[_A], *arguments: Any, client: str = "", **options: Any) -> _A:
+        """Answer a question for all archives together; server/queries defines each answer.
+
+        arguments: the fields of its request, in their order, avatars by name.
+        client: owner of the avatars.
+        options: the remaining fields by name, and
+
+        - budget_ms, and tolerance [m] and relative_tolerance of questions that take them: see
+          server/queries/request.py,
+        - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
+          scene's default,
+        - stop: stop flag that ends the work early.
+
+        A cluster of `contacts` contains points of one archive only; depths in different archives
+        are compared after rounding. `objects` are tested against one another in the frame of the
+        first archive. Raise UnknownAvatarError and the errors of the query.
+        """
+        complete = len(arguments) == len(question.arguments)
+        given = arguments if complete else question.all_arguments(arguments, options)
+        if options:
+            self.check_options(question, options)
+        if question.other_defaults:
+            options = question.other_defaults | options
+        if self._alone is None or question.whole:
+            return self._ask_placed(question, given, client, options)
+        # Neither transformation nor merging. A request of one pose takes 30 µs in all, so every
+        # function call counts here.
+        rows = given[len(question.arrays) - (not question.about_avatars)]  # of the last array
+        with self._alone.take() as opened:
+            data, budget = _terms(opened, **options) if options else (opened.data, EXACT)
+            user = ("", "")
+            subject: Any = given
+            if question.about_avatars:
+                # `record_user` takes the user's position from the last pose.
+                user = client, given[0]
+                avatar = self._avatars.get(given[0], client)
+                around = 0.0 if question.around is None else given[question.around]
+                if opened.record_user(user, avatar, rows, around):
+                    budget = budget._replace(scan=True)
+                subject = avatar, *given[1:]
+            try:
+                answers: _A = ENGINES[question.name](data, *subject, budget=budget)
+            except StoppedError:
+                answers = unknown_answers(question, _count(question, rows), budget)
+            else:
+                if budget.stopped:
+                    answers = structs.replace(answers, stopped=budget.stopped)
+        self._metrics.answered(*user, answers)
+        return answers
+
+    def _ask_placed(
+        self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
+    ) -> _A:
+        """Answer `ask` for archives that are several or not at the identity, each in its own frame."""
+        user, first = ("", ""), 0
+        subject: tuple[AvatarModel, ...] = ()
+        if question.whole:
+            user, what = (client, ""), given[1:]
+            k, place = self._place_objects(given[0], client)
+        else:
+            if question.about_avatars:
+                user, subject, first = (client, given[0]), (self.avatar(given[0], client),), 1
+            end = first + len(question.arrays)
+            around = 0.0 if question.around is None else given[question.around]
+            k, place = _place_arrays(question, given[first:end], user, subject, around)
+            what = given[end:]
+
+        def ask(data: SceneData, budget: QueryBudget, items: Sequence[Any]) -> _A:
+            found: _A = ENGINES[question.name](data, *subject, *items, *what, budget=budget)
+            return found
+
+        answers: Any = ask_each(self.archives, question, k, place, ask, **options)
+        self._metrics.answered(*user, answers)
+        if question.listed is not None and len(self.archives) > 1:
+            answers = limit_pairs(answers, given[question.arguments.index(question.listed[0])])
+        return answers  # type: ignore[no-any-return]
+
+    def _place_objects(self, objects: Any, client: str) -> tuple[int, PlaceItems]:
+        """Return the number of objects, and the function that places them in an archive's frame.
+
+        Pairs of objects are tested in the frame of the first archive only. For other archives, their
+        groups are 0: they are tested against the scene only.
+        """
+        items, poses = make_objects(objects)
+        avatars = [self.avatar(item.avatar, client) for item in items]
+        groups = np.array([item.group for item in items], np.uint32)
+        masks = np.array([item.mask for item in items], np.uint32)
+
+        def place(archive: PlacedArchive, _: ArchiveGeneration) -> PlacedItems:
+            own = archive.poses_in(poses)
+            if archive is self.archives[0]:
+                return (avatars, own, groups, masks), False
+            return (avatars, own, groups & np.uint32(0), masks & np.uint32(SCENE_GROUP)), False
+
+        return len(items), place
+
+    def path(
+        self,
+        name: str,
+        poses: ArrayLike,
+        op: str = "collide",
+        *,
+        threads: int = PATH_THREADS,
+        radius_model: str | None = None,
+        client: str = "",
+        stop: StopFlag = NO_STOP,
+        **parameters: Any,
+    ) -> Iterator[Part]:
+        """Answer `op` (collide, distance, contacts, sweep) along poses, in ordered parts.
+
+        name: of the avatar.  poses: (k, 4, 4) or (4, 4), avatar to world.
+        op: a sweep has k - 1 motions, from each pose to the next; the others examine the poses
+        only.
+        threads: parts computed at a time.  client: owner of the avatar.
+        parameters: of `op` besides the poses, including tolerance and budgets. `budget_ms` is for
+        the whole path.
+        Each part answers the items [first, first + n) of `total`. All poses are checked before the
+        first part. Raise UnknownAvatarError and the errors of `op`.
+        """
+        taken: list[ArchiveGeneration] = []
+        try:
+            for archive in self.archives:
+                taken.append(archive.take())
+            avatar, array = self.avatar(name, client), make_poses(poses)
+            legs = make_legs(self.archives, taken, radius_model, array)
+            ask, total = ask_along(legs, avatar, op, parameters, stop)
+
+            def ask_held(start: int, end: int) -> Cost:
+                # Hold the generations: the consumer may close the path, which releases `taken`.
+                with ExitStack() as stack:
+                    for opened in taken:
+                        stack.enter_context(opened.taken())
+                    part = ask(start, end)
+                self._metrics.answered(client, name, part)
+                return part
+
+            most = largest_part(op, parameters)
+            ahead = (self._path_threads.of(client), 2 * threads) if threads > 1 else (None, 1)
+            return PathParts(path_parts(ask_held, total, most, *ahead), taken)
+        except BaseException:
+            for opened in taken:
+                opened.release()
+            raise
 
     @property
     def simulation(self) -> Simulation:
@@ -435,3 +583,57 @@ class Scene(SceneQuestions):
             with suppress(BadRequestError):  # a closed archive keeps no voxels
                 archive.leave_client(client)
         self._metrics.drop_client(client)
+
+
+def _place_arrays(
+    question: Question[Any],
+    given: Sequence[Any],
+    user: tuple[str, str],
+    subject: tuple[AvatarModel, ...],
+    around: float,
+) -> tuple[int, PlaceItems]:
+    """Return the number of items, and the function that places them in an archive's frame.
+
+    given: the arrays of the request.  user: client and name of the avatar, `subject` the avatar
+    itself, if the question is about one.  around: its margin or reach [m].
+    """
+    names = tuple(question.arrays)
+    arrays = [
+        make_poses(each) if subject else make_vectors(each, name)
+        for each, name in zip(given, names, strict=True)
+    ]
+    if len(arrays[0]) != len(arrays[-1]):
+        one, other = ("poses to begin at", "to end at") if subject else (names[0], names[-1])
+        raise BadRequestError(f"{len(arrays[0])} {one} and {len(arrays[-1])} {other}: expected equal numbers")
+
+    def place(archive: PlacedArchive, opened: ArchiveGeneration) -> PlacedItems:
+        if subject:
+            own = [archive.poses_in(each) for each in arrays]
+            return own, opened.record_user(user, subject[0], own[-1], around)
+        return [
+            archive.directions_in(each) if name in question.directions else archive.points_in(each)
+            for each, name in zip(arrays, names, strict=True)
+        ], False
+
+    return len(arrays[0]), place
+
+
+def _terms(
+    opened: ArchiveGeneration,
+    tolerance: float = 0.0,
+    relative_tolerance: float = 0.0,
+    budget_ms: float | None = None,
+    radius_model: str | None = None,
+    stop: StopFlag = NO_STOP,
+) -> tuple[SceneData, QueryBudget]:
+    """Return the scene data and the budget of a request with these options."""
+    budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
+    data = opened.data if radius_model is None else opened.radius_model(radius_model)
+    return with_stop(data, budget.request), budget
+
+
+def _count(question: Question[Any], rows: ArrayLike) -> int:
+    """Return the number of items of an argument; 0 for one that has no length."""
+    if question.about_avatars:
+        return len(make_poses(rows))
+    return len(rows) if isinstance(rows, Sized) else 0

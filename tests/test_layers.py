@@ -51,29 +51,23 @@ ALLOWED = {
     "server/client.py": "scene_interface.py zenoh_common zenoh_client avatars",
     "server/residency": "kernels runtime",
     "server/cli/output": "residency",
-    "server/queries/context": "kernels runtime avatars residency",
-    "server/queries": "kernels runtime avatars residency queries/context",
-    "server/archives": "kernels observability runtime avatars residency queries/context queries",
+    "server/queries": "kernels runtime avatars residency",
+    "server/archives": "kernels observability runtime avatars residency queries",
     "server/tiles": "residency archives",
-    "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
-    "server/simulation/effects": (
-        "runtime avatars residency queries/context queries archives simulation/world"
-    ),
+    "server/simulation/world": "kernels runtime scene_interface.py avatars queries archives",
+    "server/simulation/effects": ("runtime avatars residency queries archives simulation/world"),
     "server/simulation": (
-        "runtime scene_interface.py avatars queries/context queries archives simulation/world simulation/effects"
+        "runtime scene_interface.py avatars queries archives simulation/world simulation/effects"
     ),
-    "server/scenes": (
-        "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "
-        "simulation/effects"
-    ),
+    "server/scene_archives.py": "kernels scene_interface.py avatars residency archives simulation/effects",
     "server/pictures": "avatars archives",
     "server/scene.py": (
-        "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes "
+        "observability runtime scene_interface.py avatars residency queries archives simulation scene_archives.py "
         "pictures tiles"
     ),
     "server/report/common": "cli/input cli/output avatars residency scene.py",
     "server/cli/input": "scene_interface.py",
-    "server/cli/scene_files": "scene_interface.py residency archives scenes scene.py",
+    "server/cli/scene_files": "scene_interface.py residency archives scene_archives.py scene.py",
     "server/report/accuracy/measurement": "avatars scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "scene.py report/common report/accuracy/measurement report/accuracy/page",

@@ -1,6 +1,6 @@
 """Placed archives of a scene: generations, hot reload, queries over several archives, merging.
 
-May import server.avatars, server.kernels, server.observability, server.queries,
-server.queries.context, server.residency, server.runtime, schemas.
+May import server.avatars, server.kernels, server.observability, server.queries, server.residency,
+server.runtime, schemas.
 Begin with placed_archive.py.
 """

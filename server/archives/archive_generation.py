@@ -10,15 +10,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from ...schemas.archive.archive import Archive
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
 from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_context import SceneData, make_scene_data, make_tree, with_radius_model
 from ..queries.engine_table import warm_engines
 from ..queries.level_of_detail import open_level_data, with_level
+from ..queries.scene_data import SceneData, make_scene_data, make_tree, with_radius_model
 from ..residency.eviction import EvictionPolicy, prefetches
 from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks
@@ -46,6 +45,7 @@ class ArchiveGeneration:
     radius_model: function that returns the scene data with the radius model of a name; None: the
     default. It raises BadRequestError for an invalid model, or one that the archive does not store.
     Only readers may use `data` and `radius_model`.
+    level: store and cache of the level of detail; None if none is open. Only readers may use it.
     sources: number of the sources that the archive lists; those of the next archive follow.
     kept: data that other modules store with this generation, by module name.
     number: counts the generations of this archive, from 0.
@@ -85,12 +85,11 @@ class ArchiveGeneration:
         self._lock = threading.Lock()
         self._readers = 1
         self._ending: threading.Thread | None = None
-        self._level = open_level_store(store, budget_bytes, level_bytes)
+        self.level = open_level_store(store, budget_bytes, level_bytes)
         try:
             self._assemble(budget_bytes, policy, took, radius_model, level_given=level_bytes is not None)
         except BaseException:
-            if self._level is not None:
-                self._level.store.close()
+            self._close_level()
             raise
 
     def _assemble(
@@ -106,64 +105,35 @@ class ArchiveGeneration:
 
         The other parameters are as in `__init__`.
         """
-        store = self.store
-        lattice, tree = store.archive.header.lattice, make_tree(store.archive)
-        around = UserTracks(tree, lattice.origin, lattice.step)
-        ahead = prefetches(policy)
-        if self._level is not None:
-            budget_bytes -= self._level.residency.budget_bytes
+        archive, level = self.store.archive, self.level
+        budget_bytes -= level.residency.budget_bytes if level else 0
         residency = VoxelCache(
-            store,
+            self.store,
             budget_bytes,
             EvictionPolicy(budget_bytes, policy),
             # What was given to the level may leave too little for a voxel.
-            refuse_large=self._level is None or not level_given,
+            refuse_large=level is None or not level_given,
         )
         residency.on_load_time = took
+        ahead, lattice, tree = prefetches(policy), archive.header.lattice, make_tree(archive)
         self.prefetcher = Prefetcher(
             residency,
-            around,
+            UserTracks(tree, lattice.origin, lattice.step),
             prefetch=ahead,
-            idle=level_filler(self._level),
-            level=None if self._level is None else self._level.residency,
+            idle=level_filler(level),
+            level=level and level.residency,
         )
-        figure = make_scene_data(store.archive, residency, tree)
-        level = None
-        if self._level is not None:
-            level = open_level_data(
-                self._level.store.archive,
-                self._level.residency,
-                store.archive,
-                settles_exact=ahead or level_given,
-            )
-
-        def with_radii(text: str | None) -> SceneData:
-            made = figure if text is None else with_radius_model(figure, store.archive, text)
-            return with_level(made, level)
-
-        data = with_radii(radius_model)
-        self.data = data
+        single = make_scene_data(archive, residency, tree)
+        of_level = level and open_level_data(
+            level.store.archive, level.residency, archive, settles_exact=ahead or level_given
+        )
 
         @lru_cache(_MAX_MODELS)
         def with_model(text: str | None) -> SceneData:
-            return data if text is None else with_radii(text)
+            chosen = radius_model if text is None else text
+            return with_level(with_radius_model(single, archive, chosen), of_level)
 
-        self.radius_model = with_model
-
-    @property
-    def level_bytes(self) -> int:
-        """Return the memory of the level of detail [bytes]."""
-        return 0 if self._level is None else self._level.residency.budget_bytes
-
-    @property
-    def level_archive(self) -> Archive | None:
-        """Return the level of detail; None if none is open. Only readers may use it."""
-        return None if self._level is None else self._level.store.archive
-
-    @property
-    def has_level(self) -> bool:
-        """Return whether a level of detail is open."""
-        return self._level is not None
+        self.radius_model, self.data = with_model, with_model(None)
 
     def take(self) -> bool:
         """Add a reader, which must `release`. Return False if the last reader has already left."""
@@ -198,10 +168,13 @@ class ArchiveGeneration:
         """Stop prefetching, drop the memory and close the files."""
         self.prefetcher.stop()
         del self.data, self.radius_model, self.prefetcher, self.kept
-        if self._level is not None:
-            self._level.store.close()
+        self._close_level()
         self.store.close()
         self.ended.set()
+
+    def _close_level(self) -> None:
+        if self.level is not None:
+            self.level.store.close()
 
     def __enter__(self) -> Self:
         """Return this generation; the caller is already a reader."""
@@ -254,8 +227,8 @@ class ArchiveGeneration:
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         place = archive.header.lattice.to_world(corner).tolist()
-        if self._level is not None:  # the kernels that lay a voxel of it out
-            with self._level.residency.hold([int(np.argmin(self._level.store.sizes))]):
+        if self.level is not None:  # the kernels that lay a voxel of it out
+            with self.level.residency.hold([int(np.argmin(self.level.store.sizes))]):
                 pass
         for part in parts or PARTS:
             warm_engines(self.data, place, part)

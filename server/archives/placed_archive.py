@@ -50,6 +50,7 @@ class PlacedArchive:
         budget_bytes: int,
         policy: str = "lru",
         open_store: OpenStore = VoxelStore,
+        store: VoxelStore | None = None,
         radius_model: str | None = None,
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
@@ -58,7 +59,8 @@ class PlacedArchive:
         """Open the archive in `folder`; see `Scene.open`.
 
         name: of the scene, for messages; None: that of the folder.
-        open_store: opens the folder, now and at each reload.
+        open_store: opens the folder, now and at each reload.  store: the folder, opened by it; None: open it
+        now. This closes it.
         pose: (4, 4), archive to world; None: the identity.
         took: called with the duration of each voxel load [s].
         level_bytes: see `ArchiveGeneration`.
@@ -76,7 +78,7 @@ class PlacedArchive:
             radius_model=radius_model,
             level_bytes=level_bytes,
         )
-        self._opened = self._open(0)
+        self._opened = self._open(0, store)
         # Generation replaced by the last reload; some requests may still read it.
         self._before: ArchiveGeneration | None = None
         self._info = describe(self._opened.store, self.name)
@@ -84,9 +86,9 @@ class PlacedArchive:
         self._lock = threading.Lock()
         self._reloading = threading.Lock()
 
-    def _open(self, number: int) -> ArchiveGeneration:
-        """Open the folder as it is now."""
-        store = self._open_store(self._folder)
+    def _open(self, number: int, store: VoxelStore | None = None) -> ArchiveGeneration:
+        """Open the folder as it is now, unless it is open."""
+        store = store or self._open_store(self._folder)
         try:
             return self._make_generation(store, number=number)
         except BaseException:

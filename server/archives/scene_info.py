@@ -25,6 +25,19 @@ if TYPE_CHECKING:
     from .archive_generation import ArchiveGeneration  # loads all queries; `info` needs none
 
 
+# Fields of `SceneInfo` that are those of the archive's header.
+_AS_STORED = (
+    "format_version", "points", "lattice_source", "radius", "radius_model", "radius_error", "radius_sample",
+    "moved_max", "degree", "leaf", "unknown_everywhere", "generation",
+)  # fmt: skip
+# Fields of several archives: added up, and of the archive with the largest radius. A change of any archive
+# increases the sum of their generations.
+_ADDED = ("points", "voxels", "record_bytes", "resident_bytes", "generation")
+_OF_LARGEST = (
+    "radius", "radius_model", "radius_error", "radius_sample", "radius_now", "radius_now_error",
+)  # fmt: skip
+
+
 def describe(store: VoxelStore, name: str) -> SceneInfo:
     """Return the description of an archive: counts, bounds [m], lattice, radius [m] and sources.
 
@@ -34,23 +47,13 @@ def describe(store: VoxelStore, name: str) -> SceneInfo:
     lattice, now = header.lattice, header.radius_now
     return SceneInfo(
         scene=name,
-        format_version=header.format_version,
         wire_version=WIRE_VERSION,
-        points=header.points,
         voxels=len(store.sizes),
         bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
         origin=list(lattice.origin),
         lattice_step=lattice.step,
-        lattice_source=header.lattice_source,
         voxel_size=lattice.voxel_size,
-        radius=header.radius,
-        radius_model=header.radius_model,
         radius_models=list(header.models),
-        radius_error=header.radius_error,
-        radius_sample=header.radius_sample,
-        moved_max=header.moved_max,
-        degree=header.degree,
-        leaf=header.leaf,
         sources=[
             SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
             for s in header.sources[: header.listed_sources]
@@ -59,10 +62,9 @@ def describe(store: VoxelStore, name: str) -> SceneInfo:
         record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
         resident_bytes=int(store.sizes.sum()),
         unknown=[lattice.to_world(box).tolist() for box in header.unknown],
-        unknown_everywhere=header.unknown_everywhere,
-        generation=header.generation,
         radius_now=now.radius if now else None,
         radius_now_error=now.error if now else None,
+        **{field: getattr(header, field) for field in _AS_STORED},
     )
 
 
@@ -108,18 +110,11 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
         return first
     bounds = np.array([_box(info.bounds, pose) for info, pose in each])
     largest = max(infos, key=lambda info: info.radius)
-    # A change of any archive increases the sum, so the sum is the scene's generation.
     return structs.replace(
         first,
         scene=name,
         format_version=max(info.format_version for info in infos),
-        points=sum(info.points for info in infos),
-        voxels=sum(info.voxels for info in infos),
         bounds=[bounds[:, 0].min(axis=0).tolist(), bounds[:, 1].max(axis=0).tolist()],
-        radius=largest.radius,
-        radius_model=largest.radius_model,
-        radius_error=largest.radius_error,
-        radius_sample=largest.radius_sample,
         moved_max=max(info.moved_max for info in infos),
         sources=[
             s
@@ -129,14 +124,11 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
             for s in info.sources
         ],
         skipped=[fault for info in infos for fault in info.skipped],
-        record_bytes=sum(info.record_bytes for info in infos),
-        resident_bytes=sum(info.resident_bytes for info in infos),
         unknown=[_box(box, pose).tolist() for info, pose in each for box in info.unknown],
         unknown_everywhere=any(info.unknown_everywhere for info in infos),
         radius_models=[m for m in first.radius_models if all(m in info.radius_models for info in infos)],
-        generation=sum(info.generation for info in infos),
-        radius_now=largest.radius_now,
-        radius_now_error=largest.radius_now_error,
+        **{field: sum(getattr(info, field) for info in infos) for field in _ADDED},
+        **{field: getattr(largest, field) for field in _OF_LARGEST},
     )
 
 
@@ -162,7 +154,7 @@ def make_stats(
     total, users = metrics.snapshot()
     counts = total.counts
     residencies = [opened.data.residency for opened in each]
-    level_bytes = sum(opened.level_bytes for opened in each)
+    level_bytes = sum(opened.level.residency.budget_bytes for opened in each if opened.level)
     counters = [structs.asdict(residency.counters()) for residency in residencies]
     loads = [seconds for residency in residencies for seconds in residency.load_times()]
     return StatsAnswer(

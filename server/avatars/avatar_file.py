@@ -31,47 +31,37 @@ class ReadAvatar(NamedTuple):
 def read_avatar(path: Path) -> NDArray[np.float64]:
     """Read the points (n, 3) of an avatar from a scan, or the vertices from a mesh, float64 [m].
 
-    Raise the errors of `read_vertices`.
+    Raise the errors of `read_avatar_file`.
     """
-    return read_vertices(path).points
+    return read_avatar_file(path).points
 
 
-def read_vertices(path: Path, up: str | None = None, units: str | None = None) -> ReadAvatar:
-    """Read the points of a scan, or the vertices of a mesh; up, units: as for `read_triangles_or_points`.
+def read_avatar_file(
+    path: Path, up: str | None = None, units: str | None = None, *, faces: bool = False
+) -> ReadAvatar:
+    """Read the points of a scan, or the vertices of a mesh.
 
+    up: a key of TURNS, the file's axis that points up.  units: a key of METRES, its unit of length.
+    None: what its format states, otherwise z and metres; glTF states y.
+    faces: read the triangles of a mesh instead of its vertices.
     Raise ScanError if the file cannot be read, contains no point or one that is not finite,
     TooLargeError if it has more than MAX_AVATAR_POINTS points, BadRequestError for another axis or
     unit.
     """
-    scans, placed = _open(path, up, units)
-    return ReadAvatar(np.empty((0, 3, 3)), _points(path, placed), _axes(scans[0], placed[0], up, units))
-
-
-def read_triangles_or_points(path: Path, up: str | None = None, units: str | None = None) -> ReadAvatar:
-    """Read the triangles of a mesh, or the points of a file without faces.
-
-    up: a key of TURNS, the file's axis that points up.  units: a key of METRES, its unit of length.
-    None: what its format states, otherwise z and metres; glTF states y.
-    Raise the errors of `read_vertices`.
-    """
-    scans, placed = _open(path, up, units)
-    triangles = mesh_triangles(scans[0]) if len(scans) == 1 else np.empty((0, 3, 3))
-    if not len(triangles):
-        return ReadAvatar(triangles, _points(path, placed), _axes(scans[0], placed[0], up, units))
-    if isinstance(placed[0], PlacedScan):
-        triangles = placed[0].place(triangles.reshape(-1, 3)).reshape(-1, 3, 3)
-    return ReadAvatar(triangles, np.empty((0, 3)), _axes(scans[0], placed[0], up, units))
-
-
-def _open(path: Path, up: str | None, units: str | None) -> tuple[list[Scan], list[Scan]]:
-    """Open the scans of a file; return them as they are, and in metres with z up."""
     for name, word, known in (("up", up, TURNS), ("units", units, METRES)):
         if word is not None and word not in known:
             raise BadRequestError(f"{name} {word!r} of avatar {path}: expected one of {', '.join(known)}")
     scans = open_scans(path)
     if not scans:
         raise ScanError(f"{path}: contains no point: expected at least one: choose another file")
-    return scans, [place_scan(scan, up=up, units=units) for scan in scans]
+    placed = [place_scan(scan, up=up, units=units) for scan in scans]
+    axes = _axes(scans[0], placed[0], up, units)
+    triangles = mesh_triangles(scans[0]) if faces and len(scans) == 1 else np.empty((0, 3, 3))
+    if not len(triangles):
+        return ReadAvatar(triangles, _points(path, placed), axes)
+    if isinstance(placed[0], PlacedScan):
+        triangles = placed[0].place(triangles.reshape(-1, 3)).reshape(-1, 3, 3)
+    return ReadAvatar(triangles, np.empty((0, 3)), axes)
 
 
 def _axes(scan: Scan, placed: Scan, up: str | None, units: str | None) -> str:

@@ -62,16 +62,8 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
     if radius is not None and not (np.isfinite(radius) and radius >= 0):
         raise BadRequestError(f"avatar radius {radius!r}: expected zero or a positive length in metres")
     if not len(array):
-        empty = Avatar(
-            np.empty((0, 3)),
-            np.empty(0),
-            np.empty(0, np.int32),
-            np.empty(0, np.int32),
-            np.empty((0, 3, LANES)),
-            np.empty((4, 0)),
-            0,
-            0,
-        )
+        nodes, blocks = np.empty(0, np.int32), np.empty((0, 3, LANES))
+        empty = Avatar(np.empty((0, 3)), np.empty(0), nodes, nodes, blocks, np.empty((4, 0)), 0, 0)
         return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0)
     tree = pack_points(array)
     if radius is None:

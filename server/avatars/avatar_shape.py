@@ -61,9 +61,9 @@ def avatar_shape(
         return source._replace(points=_scaled(source.points, scale), radius=radius)
     radius = None if radius is None else float(radius) * scale
     if isinstance(source, str | os.PathLike):
-        from .avatar_file import read_triangles_or_points
+        from .avatar_file import read_avatar_file
 
-        read = read_triangles_or_points(Path(source), up, units)
+        read = read_avatar_file(Path(source), up, units, faces=True)
         if len(read.triangles):
             return _mesh_shape(read.triangles * scale, radius, str(source), hollow, read.axes)
         return AvatarShape(read.points * scale, radius, 0, f"points: {_SURFACE}; {read.axes}")

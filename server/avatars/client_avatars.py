@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Collection
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,20 @@ _OWN = (EVERYBODY, THIS_PROCESS)
 _LARGE = 50_000
 
 
-class _Held(NamedTuple):
+class _Entry:
+    """Avatar in the registry.
+
+    asked: radius in the request that added it [m].  bytes: of its arrays.  used: time of the last
+    use [s].
+    """
+
+    __slots__ = ("asked", "bytes", "model", "used")
+
+    def __init__(self, model: AvatarModel, asked: float | None, size: int) -> None:
+        self.model, self.asked, self.bytes, self.used = model, asked, size, time.monotonic()
+
+
+class _Totals(NamedTuple):
     """Totals over the avatars of all clients.
 
     bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
@@ -34,22 +47,6 @@ class _Held(NamedTuple):
     bytes: int
     avatars: int
     clients: int
-
-
-class _Entry:
-    """Avatar in the registry.
-
-    model: None while it is being built.  asked: radius in the request that added it [m].
-    bytes: of its arrays.  used: time of the last use [s].
-    """
-
-    __slots__ = ("asked", "bytes", "model", "used")
-
-    def __init__(self, count: int, asked: float | None) -> None:
-        self.model: AvatarModel | None = None
-        self.asked = asked
-        self.bytes = _LEAST_BYTES + _BYTES_A_POINT * count
-        self.used = time.monotonic()
 
 
 def check_owner(client: str) -> None:
@@ -72,8 +69,7 @@ class Avatars:
     def __init__(self, limits: AvatarLimits | None = None) -> None:
         """Make an empty registry."""
         self.limits = limits
-        self._lock = threading.RLock()  # lock of `_changed`; entering it directly is faster
-        self._changed = threading.Condition(self._lock)
+        self._lock = threading.RLock()
         self._large = threading.Lock()  # held while a large avatar is built
         self._clients: dict[str, dict[str, _Entry]] = {}
 
@@ -86,7 +82,7 @@ class Avatars:
             with self._lock:
                 for owner in (client, EVERYBODY):
                     entry = self._clients.get(owner, {}).get(name)
-                    if entry is not None and entry.model is not None:
+                    if entry is not None:
                         entry.used = time.monotonic()
                         record_avatar(entry.model.digest)
                         return entry.model
@@ -102,34 +98,38 @@ class Avatars:
         """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
         radius, inner_points: as for `make_avatar`. An avatar with the name of a scene avatar must
-        equal it, and shares its arrays. Raise BadRequestError if a name is invalid or belongs to a
-        different avatar, TooLargeError beyond the limits.
+        equal it, and shares its arrays. Of two requests that add the same avatar at a time, both build
+        it and one is stored. Raise BadRequestError if a name is invalid or belongs to a different
+        avatar, TooLargeError beyond the limits.
         """
         check_avatar_name(name)
         check_owner(client)
         array = make_positions(points)
-        shared = None if client == EVERYBODY else self._scene_avatar(name)
-        if shared is not None:
-            self._check_same(name, shared, array, radius, inner_points)
-        entry = _Entry(len(array) if shared is None else 0, radius)
-        with self._reserved(name, client, len(array), entry) as entry:
-            if entry.model is None:
-                model = _built(self._large, array, radius, inner_points) if shared is None else shared.model
-                assert model is not None, "the scene's own avatars are complete"
-                digest = b"" if client == EVERYBODY else _digest(model)
-                with self._changed:
-                    entry.model, entry.used = model._replace(digest=digest), time.monotonic()
-                    if shared is None:
-                        entry.bytes = bytes_of(model)
-            known = entry.model
+        with self._lock:
+            entry = self._clients.get(client, {}).get(name)
+            shared = self._clients.get(EVERYBODY, {}).get(name)
+        if entry is None:
+            if shared is None:
+                self._check_room(name, client, len(array), _LEAST_BYTES + _BYTES_A_POINT * len(array))
+                model = self._build(array, radius, inner_points)
+                size = bytes_of(model)
+            else:
+                self._check_same(name, shared, array, radius, inner_points)
+                model, size = shared.model, _LEAST_BYTES
+            if client != EVERYBODY:
+                digest = avatar_digest(model.points, model.radius, model.inner_points)
+                model = model._replace(digest=digest)
+            with self._lock:
+                entry = self._clients.get(client, {}).get(name)
+                if entry is None:
+                    self._check_room(name, client, len(array), size)
+                    entry = self._clients.setdefault(client, {})[name] = _Entry(model, radius, size)
         self._check_same(name, entry, array, radius, inner_points)
-        return known
+        return entry.model
 
-    def _scene_avatar(self, name: str) -> _Entry | None:
-        """Return the entry of the scene avatar with this name, or None."""
-        with self._changed:
-            entry = self._clients.get(EVERYBODY, {}).get(name)
-            return None if entry is None or entry.model is None else entry
+    def _build(self, points: NDArray[np.float64], radius: float | None, inner_points: int = 0) -> AvatarModel:
+        with self._large if len(points) > _LARGE else nullcontext():
+            return make_avatar(points, radius, inner_points)
 
     def _check_same(
         self,
@@ -141,11 +141,10 @@ class Avatars:
     ) -> None:
         """Raise BadRequestError unless a known avatar has this content."""
         known = entry.model
-        assert known is not None
         same = known.inner_points == inner_points and np.array_equal(known.points, points)
         if same and radius is None and entry.asked is not None:
             # One radius is given and one is the default of the points, which only building yields.
-            radius = _built(self._large, points, None).radius
+            radius = self._build(points, None).radius
         if not same or (radius is not None and radius != known.radius):
             raise BadRequestError(
                 f"avatar {name!r} exists with other points or another radius: use another name"
@@ -153,37 +152,35 @@ class Avatars:
 
     def names(self) -> list[str]:
         """Return the names of the scene's avatars and of those added in this process, sorted."""
-        with self._changed:
+        with self._lock:
             return sorted({name for owner in _OWN for name in self._clients.get(owner, {})})
 
     def drop_client(self, client: str) -> None:
         """Drop the avatars of a client."""
-        with self._changed:
+        with self._lock:
             self._clients.pop(client, None)
 
     def drop_unused(self, alive: Collection[str], seconds: float) -> int:
         """Drop avatars unused for `seconds`, except of clients in `alive`. Return their number."""
         before, dropped = time.monotonic() - seconds, 0
-        with self._changed:
+        with self._lock:
             for client, entries in list(self._clients.items()):
                 if client in _OWN or client in alive:
                     continue
-                for name in [n for n, e in entries.items() if e.model is not None and e.used < before]:
-                    del entries[name]
-                    dropped += 1
-                if not entries:
+                kept = {name: entry for name, entry in entries.items() if entry.used >= before}
+                dropped += len(entries) - len(kept)
+                self._clients[client] = kept
+                if not kept:
                     del self._clients[client]
         return dropped
 
     def stats(self) -> AvatarStats:
         """Return the memory and number of all clients' avatars, and the limits."""
-        with self._changed:
-            held = self._held()
-        limits = self.limits
+        limits, totals = self.limits, self._totals()
         if limits is None:
-            return AvatarStats(*held)
+            return AvatarStats(*totals)
         return AvatarStats(
-            *held,
+            *totals,
             max_bytes=limits.bytes,
             max_bytes_by_client=limits.bytes_by_client,
             max_avatars=limits.avatars,
@@ -191,84 +188,32 @@ class Avatars:
             max_clients=limits.clients,
         )
 
-    def _held(self) -> _Held:
-        own = [entries for client, entries in self._clients.items() if client not in _OWN]
-        each = [entry.bytes for entries in own for entry in entries.values()]
-        return _Held(sum(each), len(each), len(own))
+    def _totals(self) -> _Totals:
+        with self._lock:
+            own = [entries for client, entries in self._clients.items() if client not in _OWN]
+            each = [entry.bytes for entries in own for entry in entries.values()]
+        return _Totals(sum(each), len(each), len(own))
 
-    @contextmanager
-    def _reserved(self, name: str, client: str, count: int, new: _Entry) -> Iterator[_Entry]:
-        """Yield the entry of a name for a `with`, known or new.
-
-        A new entry counts towards the limits while its avatar is built in the block, and is removed
-        if the block fails.
-        count: number of the avatar's points. Raise TooLargeError.
-        """
-        with self._changed:
-            while True:
-                entries = self._clients.get(client, {})
-                entry = entries.get(name)
-                if entry is None or entry.model is not None:
-                    break
-                self._changed.wait()  # another request builds it
-            if entry is None:
-                entry = new
-                if client not in _OWN:
-                    self._check(name, count, entry.bytes, client)
-                self._clients.setdefault(client, entries)[name] = entry
-        try:
-            yield entry
-        finally:
-            with self._changed:
-                if entry.model is None:
-                    self._remove(entry, name, client)
-                self._changed.notify_all()
-
-    def _remove(self, entry: _Entry, name: str, client: str) -> None:
-        entries = self._clients.get(client, {})
-        if entries.get(name) is entry:
-            del entries[name]
-            if not entries:
-                del self._clients[client]
-
-    def _check(self, name: str, count: int, size: int, client: str) -> None:
-        """Raise TooLargeError if one more avatar exceeds the limits."""
+    def _check_room(self, name: str, client: str, count: int, size: int) -> None:
+        """Raise TooLargeError if an avatar of `count` points and `size` bytes more exceeds the limits."""
         limits = self.limits
-        if limits is None:
+        if limits is None or client in _OWN:
             return
-        held = self._held()
-        own = self._clients.get(client, {})
-        own_bytes = sum(entry.bytes for entry in own.values())
+        with self._lock:
+            totals, own = self._totals(), self._clients.get(client, {})
+            own_bytes = sum(entry.bytes for entry in own.values())
         for found, more, most, what, then in (
             (own_bytes, size, limits.bytes_by_client, "bytes of this client's avatars", "thin it out"),
             (len(own), 1, limits.avatars_by_client, "avatars of this client", "use one of them again"),
-            (
-                held.bytes,
-                size,
-                limits.bytes,
-                "bytes of all clients' avatars",
-                "thin it out, or try again later",
-            ),
-            (held.avatars, 1, limits.avatars, "avatars of all clients", "try again later"),
-            (held.clients, not own, limits.clients, "clients with avatars", "try again later"),
-        ):
+            (totals.bytes, size, limits.bytes, "bytes of all clients' avatars", "thin it out, or try again later"),
+            (totals.avatars, 1, limits.avatars, "avatars of all clients", "try again later"),
+            (totals.clients, not own, limits.clients, "clients with avatars", "try again later"),
+        ):  # fmt: skip
             if found + more > most:
                 raise TooLargeError(
                     f"avatar {name!r} of {count} points: {found} {what} exist, with this one {found + more}: "
                     f"at most {most} are allowed: {then}"
                 )
-
-
-def _digest(model: AvatarModel) -> bytes:
-    return avatar_digest(model.points, model.radius, model.inner_points)
-
-
-def _built(
-    large: threading.Lock, points: NDArray[np.float64], radius: float | None, inner_points: int = 0
-) -> AvatarModel:
-    """Build an avatar. large: lock that is held while an avatar of over _LARGE points is built."""
-    with large if len(points) > _LARGE else nullcontext():
-        return make_avatar(points, radius, inner_points)
 
 
 def bytes_of(model: AvatarModel) -> int:

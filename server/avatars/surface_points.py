@@ -91,23 +91,14 @@ def cover_surface(triangles: _Triangles, radius: float | None, what: str) -> Sur
         # Triangles that share an edge compute the same bits: the sum does not depend on the order.
         middle = (first + second) / 2
         corners.append(middle)
-        triangles = np.concatenate([np.stack(half, axis=1) for half in _halves(first, second, third, middle)])
+        halves = (first, middle, third), (middle, second, third)
+        triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
         if count + len(triangles) > _MAX_TRIANGLES:
             raise _too_large(what, area, radius)
     points = _distinct(np.concatenate(corners))
     if len(points) > MAX_AVATAR_POINTS:
         raise _too_large(what, area, radius)
     return SurfaceCover(points, radius, np.concatenate(small))
-
-
-def _halves(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    third: NDArray[np.float64],
-    middle: NDArray[np.float64],
-) -> tuple[tuple[NDArray[np.float64], ...], ...]:
-    """Return the corners of both halves of triangles. middle: (n, 3), of first and second."""
-    return (first, middle, third), (middle, second, third)
 
 
 def _area(triangles: _Triangles) -> float:

@@ -1,6 +1,5 @@
 """Query `collide`: whether an avatar touches the scene, one verdict a pose."""
 
-import time
 from typing import Any
 
 import numpy as np
@@ -13,29 +12,14 @@ from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import (
-    LevelOfDetail,
-    SceneData,
-    check_request,
-    in_unknown,
-    kernel_poses,
-    to_units,
-    with_stop,
-)
 from .level_of_detail import below, find_level, level_budget, level_reach
-from .resolve import Steps, drop_items, load_and_search, resolve, run
-
-
-def collide(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
-) -> CollideAnswers:
-    """Answer `collide`; see `collide_steps`."""
-    return run(collide_steps(data, avatar, poses, margin, budget))
+from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
+from .resolve import Search, Settle, Steps, answered, drop_items, load_and_search, resolve
+from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
 
 
 def collide_steps(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, budget: QueryBudget
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
 ) -> Steps[CollideAnswers]:
     """Test whether the avatar touches the scene under each pose.
 
@@ -47,39 +31,34 @@ def collide_steps(
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    begin = time.perf_counter()
-    array = kernel_poses(poses)
-    margin_units = to_units(margin, "margin")
-    spent = CostCounter(begin, data.residency, data.keys)
+    spent = CostCounter(data)
+    array, margin_units = kernel_poses(poses), to_units(margin, "margin")
     reach = check_request(data, avatar, array, data.radius_units + margin_units)
     verdict, counts = np.zeros(len(array), np.uint8), np.zeros((3, len(array)), np.uint32)
     level = find_level(data, budget)
+    drop_clear = drop_clear_of(level, avatar, array, margin_units, budget, spent)
 
     def settle(lists: VoxelLists) -> Steps[VoxelLists]:
         lists = drop_items(lists, (verdict == CONTACT) | (verdict == EARLY))
-        if level is None or not lists.starts[-1]:
+        if level is None or drop_clear is None:
             return lists
+        lists = yield from drop_clear(lists)
         which = np.flatnonzero(np.diff(lists.starts))
-        rows = lists.rows[: lists.starts[-1]]
-        clear = yield from clear_of_rows(level, avatar, array[which], margin_units, rows, budget, spent)
-        settled = np.zeros(len(array), bool)
-        settled[which[clear]] = True
-        left = which[~clear]
-        touched = yield from _touches_level(level, avatar, array[left], margin_units, budget, spent)
-        verdict[left[touched]] = EARLY if budget.tolerance_units else CONTACT
-        settled[left[touched]] = True
-        return drop_items(lists, settled)
+        touches = yield from _touch_level(level, avatar, array[which], margin_units, budget, spent)
+        verdict[which[touches]] = EARLY if budget.tolerance_units else CONTACT
+        return drop_items(lists, (verdict == CONTACT) | (verdict == EARLY))
 
     if len(avatar.points):
         own = with_stop(data, budget.stop)
         search = _search(own, avatar, array, reach, budget.tolerance_units, verdict, counts)
         left = yield from resolve(data, reach.lists, search, budget, spent, settle)
-        verdict[(left < np.inf) & (verdict == CLEAR)] = UNKNOWN
-        # A load may have proved the index wrong by now.
-        if data.nothing_clear or len(data.unknown):
-            verdict[in_unknown(reach.boxes, data.unknown, data.nothing_clear) & (verdict == CLEAR)] = UNKNOWN
+        unseen = np.minimum(left, unseen_from(data, reach))
+        verdict[(unseen < np.inf) & (verdict == CLEAR)] = UNKNOWN
     bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
     return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
+
+
+collide = answered(collide_steps)
 
 
 def _search(
@@ -90,44 +69,48 @@ def _search(
     tolerance_units: int,
     verdict: NDArray[np.uint8],
     counts: NDArray[np.uint32],
-) -> Any:
+) -> Search:
     """Return the search of `resolve`: it writes verdict (k,) and counts (3, k)."""
 
-    def search(
-        lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
-    ) -> None:
+    def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         own = reach._replace(lists=lists)
-        collide_poses(
-            poses, avatar.arrays, data.arrays, own, which, cursor, state, tolerance_units, verdict, counts
-        )  # fmt: skip
+        collide_poses(poses, avatar.arrays, data.arrays, own, *state, tolerance_units, verdict, counts)
 
     return search
 
 
-def clear_of_rows(
-    level: LevelOfDetail,
+def drop_clear_of(
+    level: LevelOfDetail | None,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
     margin_units: int,
-    rows: NDArray[np.int64],
     budget: QueryBudget,
     spent: CostCounter,
-) -> Steps[NDArray[np.bool_]]:
-    """Return which poses (k,) the level proves clear of all the scene's voxels `rows`."""
+) -> Settle | None:
+    """Return the `settle` of `resolve` that drops those of poses (k, 4, 4) which the level proves clear.
+
+    Return None without a level.
+    """
+    if level is None:
+        return None
     covers = level.covers
-    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
-    reach = level_reach(covers, avatar, poses, margin_units)
-    if reach is None or covers.nothing_clear:
-        return np.zeros(len(poses), bool)
-    lists = below(level, reach.lists, rows)
-    own = spent.of_level(covers.residency)
-    search = _search(covers, avatar, poses, reach, 0, verdict, counts)
-    left = yield from load_and_search(covers, lists, search, level_budget(budget), own)
-    spent.add_level(own)
-    return np.asarray((verdict == CLEAR) & (left == np.inf))
+
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        which, rows = np.flatnonzero(np.diff(lists.starts)), lists.rows[: lists.starts[-1]]
+        own = poses[which]
+        reach = level_reach(covers, avatar, own, margin_units) if len(which) else None
+        if reach is None:
+            return lists
+        reach = reach._replace(lists=below(level, reach.lists, rows))
+        verdict, left = yield from _search_level(covers, avatar, own, reach, budget, spent)
+        clear = np.zeros(len(poses), bool)
+        clear[which] = (verdict == CLEAR) & (left == np.inf) & (not covers.nothing_clear)
+        return drop_items(lists, clear)
+
+    return settle
 
 
-def _touches_level(
+def _touch_level(
     level: LevelOfDetail,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
@@ -136,16 +119,27 @@ def _touches_level(
     spent: CostCounter,
 ) -> Steps[NDArray[np.bool_]]:
     """Return which poses (k,) touch a representative, within margin plus tolerance."""
-    points = level.points
-    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
-    reach = level_reach(points, avatar, poses, margin_units + budget.tolerance_units)
+    reach = level_reach(level.points, avatar, poses, margin_units + budget.tolerance_units)
     if reach is None:
         return np.zeros(len(poses), bool)
-    own = spent.of_level(points.residency)
-    search = _search(points, avatar, poses, reach, 0, verdict, counts)
-    yield from load_and_search(points, reach.lists, search, level_budget(budget), own)
-    spent.add_level(own)
+    verdict, _ = yield from _search_level(level.points, avatar, poses, reach, budget, spent)
     return np.asarray(verdict == CONTACT)
+
+
+def _search_level(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    reach: VoxelsInReach,
+    budget: QueryBudget,
+    spent: CostCounter,
+) -> Steps[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+    """Return the verdicts (k,) of poses in covers or points of a level, and what `resolve` returns."""
+    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
+    search, own = _search(data, avatar, poses, reach, 0, verdict, counts), CostCounter(data)
+    left = yield from load_and_search(data, reach.lists, search, level_budget(budget), own)
+    spent.add_level(own)
+    return verdict, left
 
 
 def verdict_bounds(

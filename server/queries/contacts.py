@@ -5,7 +5,6 @@ It serves clash detection: it returns where and how deep two bodies touch, and a
 """
 
 import operator
-import time
 from typing import Any
 
 import numpy as np
@@ -44,12 +43,12 @@ from ..kernels.core.reach import VoxelLists
 from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
-from .collide import clear_of_rows
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
-from .context.signed_distance import signed_from_square
+from .collide import drop_clear_of
+from .distance import signed_from_square
 from .level_of_detail import find_level
-from .resolve import Steps, drop_items, resolve, run
+from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
+from .resolve import Steps, answered, resolve
+from .scene_data import SceneData, to_units, with_stop
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.
@@ -59,7 +58,7 @@ MAX_BYTES = 256 << 20
 FIRST_CELLS, MAX_CELLS = 256, 1 << 20
 
 
-def contacts(
+def contacts_steps(
     data: SceneData,
     avatar: AvatarModel,
     poses: ArrayLike,
@@ -67,19 +66,6 @@ def contacts(
     margin: float = 0.0,
     cluster_distance: float | None = None,
     budget: QueryBudget = EXACT,
-) -> ContactsAnswers:
-    """Answer `contacts`; see `contacts_steps`."""
-    return run(contacts_steps(data, avatar, poses, limit, margin, cluster_distance, budget))
-
-
-def contacts_steps(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: ArrayLike,
-    limit: int,
-    margin: float,
-    cluster_distance: float | None,
-    budget: QueryBudget,
 ) -> Steps[ContactsAnswers]:
     """Find all pairs in contact under each pose: count them, list the deepest, and cluster them.
 
@@ -95,22 +81,21 @@ def contacts_steps(
     compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
     Ties are ordered by scan point, avatar centre, avatar row, scan number.
     budget: a deadline may leave pairs out; `exact` is then false, the pairs counted are the least
-    number, and the listed ones are in contact but may not be the deepest. With a tolerance, and
-    where voxels are late, the scene's level of detail may prove a pose clear without them; pairs
-    are counted exactly all the same, because a count cannot end early (DESIGN.md, "Tolerance").
+    number, and the listed ones are in contact but may not be the deepest. The level of detail may prove
+    a pose clear of voxels that are absent (`find_level`). Pairs are counted exactly whatever the
+    tolerance, because a count cannot end early (DESIGN.md, "Tolerance").
     The verdict is CONTACT if a pair was found; otherwise CLEAR, or UNKNOWN if not everything in
     reach was examined. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    begin = time.perf_counter()
-    array = kernel_poses(poses)
-    limit = _checked_limit(limit)
+    spent = CostCounter(data)
+    array, limit = kernel_poses(poses), _checked_limit(limit)
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
-    spent = CostCounter(begin, data.residency, data.keys)
     reach = check_request(data, avatar, array, data.radius_units + margin_units)
     k = len(array)
     tally = ContactResults(np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros((k, 4), np.int64))
-    memory, finished, level = empty_memory(limit), np.ones(k, bool), find_level(data, budget)
+    memory, finished = empty_memory(limit), np.ones(k, bool)
+    settle = drop_clear_of(find_level(data, budget), avatar, array, margin_units, budget, spent)
     options = ContactOptions(
         avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS,
         MAX_BYTES,
@@ -124,15 +109,6 @@ def contacts_steps(
         memory = gather_contacts(array, avatar.arrays, arrays, own, *state, options, memory, tally)
         _check_room(memory)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
-        if level is None:
-            return lists
-        which, rows = np.flatnonzero(np.diff(lists.starts)), lists.rows[: lists.starts[-1]]
-        clear = yield from clear_of_rows(level, avatar, array[which], margin_units, rows, budget, spent)
-        settled = np.zeros(k, bool)
-        settled[which[clear]] = True
-        return drop_items(lists, settled)
-
     if len(avatar.points):
         left = yield from resolve(data, reach.lists, search, budget, spent, settle, together=True)
         # A stop may leave a pose without its lists.
@@ -141,6 +117,9 @@ def contacts_steps(
             memory = list_pose(memory, tally.runs[memory.sizes[POSE]], NO_STOP.flag)
     columns = _columns(data, reach, margin_units, tally, finished, memory, len(avatar.points) > 0)
     return ContactsAnswers(**columns, **spent.fields())
+
+
+contacts = answered(contacts_steps)
 
 
 def _checked_limit(limit: int) -> int:
@@ -212,7 +191,7 @@ def _columns(
     """Return the fields of `ContactsAnswers` except the cost of the request."""
     exact = finished & (tally.counts[0] == 0)
     if has_points:  # an avatar without points is clear, even if the index is wrong
-        exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
+        exact &= unseen_from(data, reach) == np.inf
     verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
     verdict[tally.pairs > 0] = Verdict.CONTACT
     pair_starts, pairs = _by_pose(memory.pairs, tally.runs[:, :2])

@@ -1,26 +1,36 @@
 """Query `distance`: distance of an avatar from the scene, and the nearest pair.
 
-signed_distance.py has the definition.
+The definition uses the integers of NUMERICS.md N5. Let D2 = |a - b|^2 and r = r_a + r_b for a pair
+of placed avatar centre a and scan point b, with the pair's own radii, each rounded once to exact
+units. Of all pairs, take the one with the least separation sqrt(D2) - r, compared exactly. Its
+signed distance is
+
+    (D2 - r^2) / (sqrt(D2) + r) / 2^26 m
+
+with the difference in int64 and the rest in float64, in this order; it is 0 if D2 and r are 0. This
+equals sqrt(D2) - r without cancellation. It is negative if the spheres overlap, zero if they touch
+and positive if they do neither. No pair has a smaller separation, so the signed distance is
+positive exactly if no pair of spheres is in contact. If all scan points have the same radius, the
+pair is that with the least D2.
 """
 
 import math
-import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.wire.answers import DistanceAnswers
+from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, check_request, kernel_poses, to_units, with_stop
-from .context.signed_distance import distance_columns, unknown_gaps
 from .level_of_detail import below, find_level, level_budget, level_reach
-from .resolve import Search, Steps, drop_items, load_and_search, resolve, run
+from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
+from .resolve import Search, Steps, answered, drop_items, load_and_search, resolve
+from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
@@ -28,15 +38,8 @@ _ROUNDING = 4.0
 TOLERANCE_SLACK = 8.0
 
 
-def distance(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
-) -> DistanceAnswers:
-    """Answer `distance`; see `distance_steps`."""
-    return run(distance_steps(data, avatar, poses, reach, budget))
-
-
 def distance_steps(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> Steps[DistanceAnswers]:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
@@ -49,9 +52,8 @@ def distance_steps(
     examined pair, and exact only if nothing else can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    begin = time.perf_counter()
+    spent = CostCounter(data)
     array, reach_units = kernel_poses(poses), to_units(reach, "reach")
-    spent = CostCounter(begin, data.residency, data.keys)
     around = check_request(data, avatar, array, data.radius_units + reach_units)
     nearest, counts = no_pairs(len(array)), np.zeros((3, len(array)), np.uint32)
     # A level does not know the radii of a scene with several.
@@ -91,10 +93,13 @@ def distance_steps(
         missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
         missing = np.minimum(missing, settled_bound)
         np.minimum(missing, resident_bound, out=nearest.missing_bound)
-        np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
+        np.minimum(nearest.missing_bound, unseen_from(data, around), out=nearest.missing_bound)
     return DistanceAnswers(
-        **distance_columns(data, around, float(reach), reach_units, nearest, counts), **spent.fields()
+        **_columns(data, around, float(reach), reach_units, nearest, counts), **spent.fields()
     )
+
+
+distance = answered(distance_steps)
 
 
 def no_pairs(k: int) -> NearestPairs:
@@ -156,9 +161,9 @@ def _ask_level(
     """
     k, covers, points, exact = len(poses), level.covers, level.points, level_budget(budget)
     around, near = (level_reach(each, avatar, poses, reach_units) for each in (covers, points))
-    if around is None or near is None or covers.nothing_clear:
+    if around is None or near is None:
         return np.zeros(k)
-    own, counts = spent.of_level(covers.residency), np.zeros((3, k), np.uint32)
+    own, counts = CostCounter(covers), np.zeros((3, k), np.uint32)
     covered, pairs = no_pairs(k), no_pairs(k)
     search = _search(covers, avatar, poses, around, reach_units, exact, covered, counts)
     left = yield from load_and_search(covers, below(level, around.lists, rows), search, exact, own)
@@ -172,6 +177,8 @@ def _ask_level(
     # that are missing.
     grown, per_step = covers.radius_units - points.radius_units, covers.arrays.units_per_step
     missing = np.minimum(covered.missing_bound, left) * per_step
+    if covers.nothing_clear:  # a load may have proved the index of the level wrong
+        missing[:] = 0.0
     lower = np.minimum(_lengths(covered) + covered.deficit, missing) - grown - _ROUNDING
     return np.asarray(np.maximum(lower, 0.0) / per_step * (1.0 - 1e-12))
 
@@ -194,3 +201,72 @@ def _lengths(pairs: NearestPairs) -> NDArray[np.float64]:
     """Return the distances of pairs (k,) [exact units]; inf for none."""
     square = np.where(pairs.square >= 0, pairs.square.astype(np.float64), np.inf)
     return np.asarray(np.sqrt(square), np.float64)
+
+
+def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the signed distances (k,) [m] of pairs.
+
+    square: |a - b|^2.  radii: r_a + r_b. Both are in exact units.
+    """
+    above = (square - radii * radii).astype(np.float64)
+    both = np.sqrt(square.astype(np.float64)) + radii.astype(np.float64)
+    return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
+
+
+def signed_bound(
+    steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return lower bounds (k,) of the signed distance [m] for centres at least `steps` apart.
+
+    radii: (k,) sum of the largest radii of avatar and scan, exact units.
+    """
+    metres = steps * data.arrays.step * (1.0 - 1e-12)
+    return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
+
+
+def _columns(
+    data: SceneData,
+    reach: VoxelsInReach,
+    farthest: float,
+    reach_units: int,
+    nearest: NearestPairs,
+    counts: NDArray[np.uint32],
+) -> dict[str, Any]:
+    """Return the fields of `DistanceAnswers` except the cost of the request.
+
+    farthest: the requested reach [m].  reach_units: the same, exact units.
+    nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
+    examined.
+    """
+    radii = reach.units - reach_units  # of the largest spheres
+    found = nearest.square >= 0
+    signed = np.where(
+        found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.deficit), np.inf
+    )
+    floor = np.maximum(signed_bound(nearest.missing_bound, data, radii), -radii / UNITS_PER_METRE)
+    # `farthest` may exceed the reach in exact units by a rounding.
+    exact = floor >= np.where(found, signed, farthest)
+    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(signed, floor), farthest))
+    verdict = np.where(signed <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
+    verdict[exact & (signed > 0)] = Verdict.CLEAR
+    origin = data.arrays.origin
+    difference = (nearest.pair[:, 3:] - _units_of(data, nearest.pair[:, :3])).astype(np.float64)
+    length = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64))[:, None]
+    normal = np.divide(difference, length, out=np.zeros((len(found), 3)), where=length > 0)
+    nowhere = ~found
+    witness_avatar = nearest.pair[:, 3:] / UNITS_PER_METRE + origin
+    witness_cloud = (
+        nearest.pair[:, :3] * data.arrays.step + origin
+    )  # as schemas/archive/voxel_grid.py Lattice.to_world
+    for column in (normal, witness_avatar, witness_cloud):
+        column[nowhere] = np.nan
+    return {
+        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": signed.copy(),
+        "exact": exact, "witness_avatar": witness_avatar, "witness_cloud": witness_cloud, "normal": normal,
+        "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
+    }  # fmt: skip
+
+
+def _units_of(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Convert lattice points to exact units (k, 3): one product, half to even (NUMERICS.md N5)."""
+    return np.rint(lattice.astype(np.float64) * data.arrays.units_per_step).astype(np.int64)

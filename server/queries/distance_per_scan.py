@@ -1,6 +1,5 @@
 """Separation of each scan of an archive from an avatar under one pose, to estimate scan noise."""
 
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,13 +9,13 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.contacts.contact_cells import BY_SCAN, CELLS, DEFICIT, PLACE, SQUARE, ContactOptions
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.reach import VoxelLists
-from .collide import clear_of_rows
+from .collide import drop_clear_of
 from .contacts import MAX_BYTES, MAX_CELLS, empty_memory
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units, with_stop
-from .context.signed_distance import signed_from_square
+from .distance import signed_from_square
 from .level_of_detail import find_level
-from .resolve import Steps, drop_items, resolve, run
+from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
+from .resolve import resolve, run
+from .scene_data import SceneData, to_units, with_stop
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.
 ANY_SCAN = -1
@@ -53,33 +52,24 @@ def separation_per_scan(
     budget: a deadline may leave pairs out; `exact` is then false.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
+    spent, margin_units = CostCounter(data), to_units(margin, "margin")
     poses = kernel_poses(np.asarray(pose)[None])
-    margin_units = to_units(margin, "margin")
-    units = data.radius_units + margin_units
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
-    reach = check_request(data, avatar, poses, units)
+    reach = check_request(data, avatar, poses, data.radius_units + margin_units)
     if not len(avatar.points):
         return ScanSeparations({}, True)
     tally = ContactResults(np.zeros((3, 1), np.int64), np.zeros(1, np.int64), np.zeros((1, 4), np.int64))
     options = ContactOptions(avatar.rows, np.full(1, BY_SCAN), True, 0, MAX_CELLS, MAX_BYTES)
-    memory, level, arrays = empty_memory(0), find_level(data, budget), with_stop(data, budget.stop).arrays
+    memory, arrays = empty_memory(0), with_stop(data, budget.stop).arrays
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         nonlocal memory
         own = reach._replace(lists=lists)
         memory = gather_contacts(poses, avatar.arrays, arrays, own, *state, options, memory, tally)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
-        if level is None or not lists.starts[-1]:
-            return lists
-        rows = lists.rows[: lists.starts[-1]]
-        clear = yield from clear_of_rows(level, avatar, poses, margin_units, rows, budget, spent)
-        return drop_items(lists, clear)
-
+    settle = drop_clear_of(find_level(data, budget), avatar, poses, margin_units, budget, spent)
     left = run(resolve(data, reach.lists, search, budget, spent, settle))
     missing, visits, tests = tally.counts[:, 0].tolist()
-    exact = left[0] == np.inf and missing == 0
-    exact &= not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
+    exact = missing == 0 and min(left[0], unseen_from(data, reach)[0]) == np.inf
     cells = memory.cells.table[: memory.sizes[CELLS]]
     numbers = np.where(cells[:, PLACE] < scans, cells[:, PLACE], ANY_SCAN)
     gaps = signed_from_square(cells[:, SQUARE], reach.units[0] - margin_units - cells[:, DEFICIT])

@@ -8,9 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...schemas.wire.answers import SweepAnswers
 from ...schemas.wire.question_rules import Question
 from ...schemas.wire.question_table import (
     COLLIDE,
@@ -22,37 +20,23 @@ from ...schemas.wire.question_table import (
     SWEEP,
     WITHIN,
 )
-from ..avatars.avatar_model import AvatarModel, make_avatar
+from ..avatars.avatar_model import make_avatar
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, QueryBudget
-from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
+from .request import EXACT, QueryBudget
 from .resident_fast_path import collide_fast, distance_fast
+from .scene_data import SceneData
 from .sweep import sweep
 from .within import within
-
-
-def _sweep(
-    data: SceneData,
-    avatar: AvatarModel,
-    pose_from: ArrayLike,
-    pose_to: ArrayLike,
-    margin: float = 0.0,
-    *,
-    budget: QueryBudget,
-) -> SweepAnswers:
-    """Answer `sweep`, whose tolerance is also the length of its intervals."""
-    return sweep(data, avatar, pose_from, pose_to, margin, budget.tolerance, budget)
-
 
 ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,
     DISTANCE.name: distance_fast,
     CONTACTS.name: contacts,
-    SWEEP.name: _sweep,
+    SWEEP.name: sweep,
     RAYCAST.name: raycast,
     WITHIN.name: within,
     OBJECTS.name: objects,

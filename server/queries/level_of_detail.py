@@ -22,9 +22,9 @@ from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..residency.voxel_cache import VoxelCache
 from ..runtime.stop_flag import StoppedError
-from .context.query_budget import QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, check_request, make_scene_data, with_stop
+from .request import QueryBudget, check_request
 from .resolve import drop_entries
+from .scene_data import LevelOfDetail, SceneData, make_scene_data, with_stop
 
 
 class LevelData(NamedTuple):

@@ -13,9 +13,9 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.reach import Items, VoxelLists, find_lists
 from ..kernels.rays.rays import ClosestHits, RayBatch
-from .context.query_budget import CostCounter, QueryBudget
-from .context.query_context import SceneData, with_stop
+from .request import CostCounter, QueryBudget
 from .resolve import Steps, drop_items, resolve
+from .scene_data import SceneData, with_stop
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14

@@ -4,7 +4,6 @@ Nothing is stored between requests: a door or a vehicle is an object of the requ
 current pose.
 """
 
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,11 +16,10 @@ from ...schemas.wire.answers import ObjectsAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.stop_flag import NO_STOP, StoppedError
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
+from .request import EXACT, CostCounter, QueryBudget, check_avatar, kernel_poses
 from .resident_fast_path import collide_fast
+from .scene_data import SceneData, to_units, with_stop
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -75,11 +73,10 @@ def objects(
     listed as UNKNOWN.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    begin = time.perf_counter()
+    spent = CostCounter(data)
     checked = _check(data, avatars, poses, groups, masks, margin)
     n = len(checked.poses)
     verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
-    spent = CostCounter(begin, data.residency, data.keys)
     for number, model in enumerate(checked.models):
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
@@ -125,10 +122,7 @@ def _check(
     units = np.empty(n, np.int64)
     for number, model in enumerate(distinct.values()):
         rows = np.flatnonzero(model_of == number)
-        unit = np.zeros(len(rows), np.int64)
-        fault, pose, found = check_poses(array[rows], model.arrays.radius, model.radius, 0, data.arrays, unit)
-        refuse(fault, int(rows[pose]), found)
-        units[rows] = unit
+        units[rows] = check_avatar(data, model, array[rows], 0, rows)
     if n > 1:
         first, second = (int(row) for row in np.argsort(-units, kind="stable")[:2])
         together = int(units[first] + units[second]) + margin_units

@@ -6,13 +6,10 @@ blocks others for long. The answers do not depend on it, except for the cost cou
 """
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from ...schemas.errors import SolidcloudError
 from ...schemas.wire.answers import Cost, Part
@@ -20,11 +17,10 @@ from ...schemas.wire.arrays import Poses
 from ...schemas.wire.path_messages import answers_to_part, check_path_parameters, split_answers
 from ...schemas.wire.question_table import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at
-from .context.query_budget import ask_until_stopped, make_budget, unknown_answers
-from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .engine_table import ENGINES
+from .request import ask_until_stopped, check_avatar, kernel_poses, make_budget, unknown_answers
+from .scene_data import SceneData, to_units, with_stop
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2
@@ -41,13 +37,9 @@ _PART_BYTES = 8 << 20
 Ask = Callable[[int, int], Cost]
 
 
-class AskPart(Protocol):
-    """Function that computes answers [start, end) of a path, which form a part.
-
-    begun: when the part began, on time.perf_counter()'s clock [s]; None: now.
-    """
-
-    def __call__(self, start: int, end: int, begun: float | None = None) -> Cost: ...
+# Function that computes answers [start, end) of a path, which form a part that begins at a time on
+# time.perf_counter()'s clock [s].
+AskPart = Callable[[int, int, float], Cost]
 
 
 def path_question(
@@ -63,7 +55,7 @@ def path_question(
     The budget's time begins with this call.
     poses: (k, 4, 4) float64.  parameters: of `op`, including tolerance and budgets.
     stop: ends the path early. A part that takes longer than `stop.part_seconds` is stopped without
-    the rest of the path; see `AskPart`.
+    the rest of the path.
     All poses are checked here, so that an error names a pose by its position on the path. Raise
     BadRequestError, BadTransformError, TooLargeError.
     """
@@ -72,20 +64,14 @@ def path_question(
     budgets = {name: given.pop(name) for name in ("relative_tolerance", "budget_ms") if name in given}
     question, engine = QUESTIONS[op], ENGINES[op]
     tolerance = given.pop("tolerance", question.other_defaults.get("tolerance", 0.0))
-    # The voxels along a path are used once. Half of the cache is left for those at users'
-    # positions, which take at most half (prefetch.py).
-    budget = make_budget(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
+    # The voxels along a path are used once.
+    budget = make_budget(tolerance, **budgets, stop=stop)._replace(scan=True)
     poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
     around = next(name for name in question.parameters if name in ("margin", "reach"))
     other = to_units(given.setdefault(around, question.defaults[around]), around)
-    units = np.empty(len(poses), np.int64)
-    other += data.radius_units
-    fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.request).arrays, units
-    )
-    refuse(fault, pose, found)
+    check_avatar(with_stop(data, budget.request), avatar, poses, data.radius_units + other)
 
-    def ask(start: int, end: int, begun: float | None = None) -> Cost:
+    def ask(start: int, end: int, begun: float) -> Cost:
         if budget.stop:
             return unknown_answers(question, end - start, budget)
         what = [poses[start:end], poses[start + 1 : end + 1]] if question.moving else [poses[start:end]]
@@ -100,13 +86,13 @@ def path_question(
     return ask, question.items_along(len(poses))
 
 
-def part_stop(stop: StopFlag, seconds: float, begun: float | None) -> StopFlag:
-    """Return the stop flag of a part: set after `seconds` or with the path's. begun: see `AskPart`."""
+def part_stop(stop: StopFlag, seconds: float, begun: float) -> StopFlag:
+    """Return the stop flag of a part that began at `begun`: set after `seconds` or with the path's."""
     if seconds == math.inf:
         return stop
     part = stop.part()
     reason = f"a part took longer than {seconds:g} s, the most that this server spends on one"
-    stop_at(part, (time.perf_counter() if begun is None else begun) + seconds, reason)
+    stop_at(part, begun + seconds, reason)
     return part
 
 

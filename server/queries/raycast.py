@@ -1,7 +1,5 @@
 """Query `raycast`: the first scan point's sphere that each ray hits."""
 
-import time
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -11,10 +9,10 @@ from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.rays.rays import ClosestHits, follow_rays
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, to_units
 from .nearest_hits import find_hits, make_origins, verdict_and_bounds
+from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
+from .scene_data import SceneData, to_units
 
 # Differences within this reach [m] are exact in float64: 2^53 units are 134,000 km.
 MAX_RAY_REACH = 1e6
@@ -55,7 +53,7 @@ def raycast_steps(
     something in reach was not examined. If that could hide a nearer hit, `exact` is false and `lower`
     bounds its distance. Raise BadRequestError.
     """
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    spent = CostCounter(data)
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):

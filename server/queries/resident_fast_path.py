@@ -33,9 +33,9 @@ from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
 from ..residency.voxel_cache import VoxelCache
 from .collide import collide
-from .context.query_budget import EXACT, QueryBudget
-from .context.query_context import SceneData, kernel_poses, refuse, to_units
 from .distance import distance
+from .request import EXACT, QueryBudget, kernel_poses, refuse
+from .scene_data import SceneData, to_units
 from .sweep import sweep
 
 Vec = NDArray[np.float64]
@@ -139,7 +139,7 @@ def distance_fast(
 
 def _has_unknown(data: SceneData) -> bool:
     """Return whether a scan was left out anywhere, or a load proved the index wrong."""
-    return data.nothing_clear or len(data.unknown) > 0
+    return data.nothing_clear or len(data.tree.unknown) > 0
 
 
 class SweepResult(NamedTuple):

@@ -18,16 +18,18 @@ search bounds it by its box. Loads that came too late are owed (residency).
 """
 
 from collections.abc import Callable, Generator
-from typing import TypeVar
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from .context.query_budget import CostCounter, QueryBudget
-from .context.query_context import SceneData
+from .request import CostCounter, QueryBudget
+from .scene_data import SceneData
 
 _A = TypeVar("_A")
+_P = ParamSpec("_P")
 # Share of the cache that a round holds at once: the rest stays with the voxels kept for users.
 SHARE = 0.5
 
@@ -50,6 +52,17 @@ def run(steps: Steps[_A]) -> _A:
         except StopIteration as ended:
             answers: _A = ended.value
             return answers
+
+
+def answered(steps: Callable[_P, Steps[_A]]) -> Callable[_P, _A]:
+    """Return the function that runs the query through whose steps this generator is."""
+
+    @wraps(steps)
+    def answer(*args: _P.args, **kwargs: _P.kwargs) -> _A:
+        return run(steps(*args, **kwargs))
+
+    answer.__name__ = steps.__name__.removesuffix("_steps")
+    return answer
 
 
 def resolve(

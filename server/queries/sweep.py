@@ -1,10 +1,9 @@
 """Query `sweep`: first contact of an avatar with the scene on a motion between two poses."""
 
-import time
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
+from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
@@ -12,7 +11,6 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import check_poses
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import (
@@ -23,36 +21,16 @@ from ..kernels.motion.sweep_segments import (
     plan_segments,
 )
 from ..runtime.stop_flag import StoppedError
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, kernel_poses, refuse, to_units, with_stop
 from .level_of_detail import below, find_level, level_budget
-from .resolve import Steps, drop_items, resolve, run
+from .request import EXACT, CostCounter, QueryBudget, check_avatar, kernel_poses
+from .resolve import Steps, answered, drop_items, resolve
+from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
 
 # `tolerance` of a request that gives none [m].
 DEFAULT_TOLERANCE = 1e-6
 # Tolerance of a sweep through the level, as a share of the request's, and at least [m]: no time is spent
 # on less than covers.
 _LEVEL_SHARE, _LEVEL_LEAST = 0.25, 1e-4
-
-
-def _check(
-    data: SceneData,
-    avatar: AvatarModel,
-    first: NDArray[np.float64],
-    last: NDArray[np.float64],
-    other_units: int,
-) -> NDArray[np.int64]:
-    """Check the poses of k motions, and return the reach (k,) of each [exact units].
-
-    The reach includes the scan's largest sphere.
-    """
-    units = np.zeros(len(first), np.int64)  # a stop may leave some unchanged
-    for poses in (first, last):
-        fault, pose, found = check_poses(
-            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, units
-        )
-        refuse(fault, pose, found)
-    return units
 
 
 def _from_origin(
@@ -93,27 +71,14 @@ def _answers(
     )  # fmt: skip
 
 
-def sweep(
-    data: SceneData,
-    avatar: AvatarModel,
-    pose_from: ArrayLike,
-    pose_to: ArrayLike,
-    margin: float = 0.0,
-    tolerance: float = DEFAULT_TOLERANCE,
-    budget: QueryBudget = EXACT,
-) -> SweepAnswers:
-    """Answer `sweep`; see `sweep_steps`."""
-    return run(sweep_steps(data, avatar, pose_from, pose_to, margin, tolerance, budget))
-
-
 def sweep_steps(
     data: SceneData,
     avatar: AvatarModel,
     pose_from: ArrayLike,
     pose_to: ArrayLike,
-    margin: float,
-    tolerance: float,
-    budget: QueryBudget,
+    margin: float = 0.0,
+    tolerance: float = 0.0,
+    budget: QueryBudget = EXACT,
     part: "LevelPart | None" = None,
 ) -> Steps[SweepAnswers]:
     """Find the first contact of the avatar with the scene on the screw motion between two poses.
@@ -132,7 +97,7 @@ def sweep_steps(
     Where voxels are absent, the scene's level of detail may prove how far the motion is clear of them
     (`find_level`). Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    begin = time.perf_counter()
+    spent = CostCounter(data)
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
     tolerance = max(tolerance, budget.tolerance)
@@ -143,7 +108,8 @@ def sweep_steps(
         )
     k, world = len(first), (first, last)
     other_units = data.radius_units + to_units(margin, "margin")
-    units = _check(data, avatar, first, last, other_units)
+    units = check_avatar(data, avatar, first, other_units)
+    check_avatar(data, avatar, last, other_units)
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
@@ -154,7 +120,6 @@ def sweep_steps(
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
     box, scratch = avatar_box(avatar.arrays), make_scratch(avatar.arrays)
-    spent = CostCounter(begin, data.residency, data.keys)
     # The default tolerance is the rounding of an interval: such a sweep is an exact request.
     level = find_level(data, budget if tolerance > DEFAULT_TOLERANCE else budget._replace(tolerance=0.0))
     settled: NDArray[np.bool_] = np.zeros(k, bool)
@@ -221,7 +186,10 @@ def sweep_steps(
         budget.lacked(len(spent.late))
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
-    return msgspec.structs.replace(answers, **spent.fields())
+    return structs.replace(answers, **spent.fields())
+
+
+sweep = answered(sweep_steps)
 
 
 def _plan(
@@ -274,7 +242,8 @@ def _clear_until(
     spent: CostCounter,
 ) -> Steps[NDArray[np.float64]]:
     """Return the fraction (k,) up to which the level proves that motions, world, touch none of its voxels."""
-    covers, own = part.level.covers, spent.of_level(part.level.covers.residency)
+    covers = part.level.covers
+    own = CostCounter(covers)
     within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
     try:
         found = yield from sweep_steps(

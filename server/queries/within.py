@@ -1,7 +1,5 @@
 """Query `within`: the scan point nearest to each query point."""
 
-import time
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,10 +7,10 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.rays.points import search_points
-from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, to_units
 from .nearest_hits import find_hits, found_units, make_origins, verdict_and_bounds
+from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
+from .scene_data import SceneData, to_units
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT) -> WithinAnswers:
@@ -30,7 +28,7 @@ def within_steps(
     units, leaves the box of all scan points. Verdicts and bounds are as for `raycast`.
     Raise BadRequestError.
     """
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    spent = CostCounter(data)
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:

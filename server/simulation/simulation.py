@@ -46,7 +46,7 @@ from ...schemas.wire.stats import EffectStats
 from ..archives.placed_archive import PlacedArchive
 from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import LateVoxels, QueryBudget
+from ..queries.request import LateVoxels, QueryBudget
 from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars

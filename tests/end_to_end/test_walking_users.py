@@ -216,7 +216,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
     rng = np.random.default_rng(12)
     users = [User("a", "box"), User("b", "box")]  # as an avatar of the scene
     moved = {}
-    with Scene.open(path, read_points=np.loadtxt) as scene, recorded(scene, path, log):
+    with Scene.open(path) as scene, recorded(scene, path, log):
         scene.simulation.warm()
         for number in range(60):
             turns = []
@@ -229,7 +229,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
             for outcome in scene.simulation.step(turns):
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
-    with Scene.open(path, read_points=np.loadtxt) as scene:  # not warmed: warming leaves no trace
+    with Scene.open(path) as scene:  # not warmed: warming leaves no trace
         assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None, 0)
 
 

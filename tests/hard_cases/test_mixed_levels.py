@@ -19,9 +19,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
@@ -60,7 +60,7 @@ def opened(archive: Path, body: NDArray[np.float64], rows: set[int]) -> Iterator
     with Scene.open(archive, budget_bytes=2 * room, level_bytes=room, open_store=lambda _: store) as scene:
         store.rows = rows
         with scene.archives[0].take() as generation:
-            level = generation._level
+            level = generation.level
             assert level is not None and level.fits
             with level.residency.hold(range(len(level.store.sizes))), scene.residency.hold(sorted(rows)):
                 scene.add_avatar("body", body, 0.01)
@@ -73,7 +73,7 @@ def ask(scene: Scene, poses: NDArray[np.float64], budget: QueryBudget) -> list[A
     return [
         collide(data, avatar, poses, MARGIN, budget),
         distance(data, avatar, poses, REACH, budget),
-        sweep(data, avatar, poses[:-1], poses[1:], MARGIN, budget=budget),
+        sweep(data, avatar, poses[:-1], poses[1:], MARGIN, DEFAULT_TOLERANCE, budget),
     ]
 
 

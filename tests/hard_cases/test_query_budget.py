@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.request import QueryBudget
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict

@@ -16,7 +16,7 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import QueryBudget
+from solidcloud.server.queries.request import QueryBudget
 from sweep_poses import at, turn_z
 
 POINT = np.zeros((1, 3))
@@ -214,7 +214,7 @@ def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
     with judged_sweeps.opened(case) as data:
         steps = np.rint((box - data.arrays.origin) / data.arrays.step).astype(np.int64)
         tree = data.tree._replace(unknown=steps.astype(np.float64))
-        partly = data._replace(unknown=steps, tree=tree)
+        partly = data._replace(tree=tree)
         nowhere = data._replace(unknown_everywhere=True)
         reached = (
             judged_sweeps.ask(partly, POINT, 0.5, at(6.0, 1.5), at(1.0, 1.5)),

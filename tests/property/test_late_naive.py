@@ -19,9 +19,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import LateVoxels, QueryBudget
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.queries.request import LateVoxels, QueryBudget
+from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
 from solidcloud.server.queries.within import within
 from solidcloud.server.scene import Scene
 
@@ -54,7 +54,7 @@ def test_what_a_frame_is_told_without_waiting_is_true(
         own = make_avatar(avatar, 0.02)
         with Scene.open(case.archive) as judge, judge.archives[0].take() as opened:
             info, data = judge.info(), opened.radius_model(model)
-            swept = sweep(data, own, poses[:-1], poses[1:])
+            swept = sweep(data, own, poses[:-1], poses[1:], tolerance=DEFAULT_TOLERANCE)
         scan = (stored, info.origin, info.lattice_step, radii, avatar, 0.02)
         judged = naive_distance.distance_by_radii(*scan, poses, 5.0)
         signed = np.array([math.inf if found is None else found.signed for found in judged])
@@ -63,9 +63,9 @@ def test_what_a_frame_is_told_without_waiting_is_true(
                 data, where = opened.radius_model(model), opened.data.residency.where
                 known = rng.random(len(where)) < rng.choice([0.0, 0.5, 1.0])
                 caches = [(opened.data.residency, known)]
-                if opened._level is not None:
-                    there = rng.random(len(opened._level.store.sizes)) < rng.choice([0.0, 0.7, 1.0])
-                    caches.append((opened._level.residency, there))
+                if opened.level is not None:
+                    there = rng.random(len(opened.level.store.sizes)) < rng.choice([0.0, 0.7, 1.0])
+                    caches.append((opened.level.residency, there))
                 for cache, rows in caches:
                     with cache.hold(np.flatnonzero(rows).tolist()):
                         pass
@@ -98,7 +98,15 @@ def _judge(data: Any, own: Any, poses: Any, signed: Any, swept: Any) -> None:
         near = within(data, pose[None, :3, 3], 0.3, budget)
         assert near.lower[0] <= near.distance[0]
     for number in range(len(poses) - 1):
-        said = sweep(data, own, poses[number : number + 1], poses[number + 1 : number + 2], budget=budget)
+        said = sweep(
+            data,
+            own,
+            poses[number : number + 1],
+            poses[number + 1 : number + 2],
+            0.0,
+            DEFAULT_TOLERANCE,
+            budget,
+        )
         verdict = said.verdict[0]
         assert said.lower[0] <= min(swept.upper[number], 1.0)
         if verdict == Verdict.CLEAR:

@@ -1,17 +1,15 @@
 """Engine of `count_within`: tests every stored point of the voxels in reach, in exact units."""
 
-import time
-
 import numpy as np
 from count_within_question import CountWithinAnswers
 from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.core.reach import MISSING, NOT_HELD, Items, VoxelLists, find_lists
 from solidcloud.server.kernels.core.scene_arrays import LANES, SceneArrays
-from solidcloud.server.queries.context.query_budget import EXACT, CostCounter, QueryBudget
-from solidcloud.server.queries.context.query_context import SceneData, to_units
 from solidcloud.server.queries.nearest_hits import make_origins
+from solidcloud.server.queries.request import EXACT, CostCounter, QueryBudget
 from solidcloud.server.queries.resolve import Steps, resolve, run
+from solidcloud.server.queries.scene_data import SceneData, to_units
 
 
 def count_within(
@@ -25,7 +23,7 @@ def count_within_steps(
     data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
 ) -> Steps[CountWithinAnswers]:
     """Answer `count_within` in slices."""
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    spent = CostCounter(data)
     _, units = make_origins(data, points, "points")
     reach_units, k = to_units(reach, "reach"), len(units)
     scene = data.arrays

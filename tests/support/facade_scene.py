@@ -108,11 +108,6 @@ class Walker:
         return np.array([state.pose[0, :3, 3] for state in self.states])
 
 
-def _no_avatars(path: Path) -> NDArray[np.float64]:
-    """Return no avatars: these scenes have none of their own."""
-    raise AssertionError(path)
-
-
 class Served(NamedTuple):
     """A served scene and a client of it."""
 
@@ -141,7 +136,7 @@ def serving_scene(folder: Path, text: str) -> Iterator[Served]:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     with (
-        Scene.open(folder / "scene.toml", read_points=_no_avatars) as scene,
+        Scene.open(folder / "scene.toml") as scene,
         serving([scene], ServerConfig(listen=endpoint)),
         Client(endpoint, scene=scene.name) as client,
     ):

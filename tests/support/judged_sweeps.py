@@ -12,8 +12,8 @@ import radius_class_archives
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 
@@ -73,7 +73,7 @@ def ask(
     **options: Any,
 ) -> SweepAnswers:
     """Return the answers for motions from first to last (k, 4, 4)."""
-    return sweep(data, make_avatar(avatar, radius), first, last, **options)
+    return sweep(data, make_avatar(avatar, radius), first, last, **{"tolerance": DEFAULT_TOLERANCE} | options)
 
 
 def moved(avatar: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> float:

@@ -21,7 +21,7 @@ def blocked_loads(scene: Scene) -> Iterator[threading.Event]:
     """Block all loads of voxels of a scene, and of its levels of detail, until the event is set."""
     gate, stores = threading.Event(), []
     with scene.archives[0].take() as opened:
-        stores = [opened.store] + ([] if opened._level is None else [opened._level.store])
+        stores = [opened.store] + ([] if opened.level is None else [opened.level.store])
     loads = [store.load for store in stores]
 
     def slow(load: Any) -> Any:

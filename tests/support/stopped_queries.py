@@ -9,13 +9,13 @@ from solidcloud.schemas.wire import question_table as questions
 from solidcloud.schemas.wire.answers import ObjectsAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import QueryBudget, ask_until_stopped
-from solidcloud.server.queries.context.query_context import SceneData, with_stop
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.distance_per_scan import separation_per_scan
 from solidcloud.server.queries.objects import objects
 from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.request import QueryBudget, ask_until_stopped
 from solidcloud.server.queries.resident_fast_path import collide_fast, distance_fast
+from solidcloud.server.queries.scene_data import SceneData, with_stop
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 
@@ -70,7 +70,9 @@ QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
     "distance": _distance,
     "distance of one pose": _near,
     "contacts": lambda a, e: _ask(contacts, len(a.poses), a, e, a.avatar, a.poses, 20, a.margin + 0.02),
-    "sweep": lambda a, e: _ask(sweep, len(a.poses) - 1, a, e, a.avatar, a.poses[:-1], a.poses[1:], a.margin),
+    "sweep": lambda a, e: _ask(
+        sweep, len(a.poses) - 1, a, e, a.avatar, a.poses[:-1], a.poses[1:], a.margin, 1e-6
+    ),
     "raycast": lambda a, e: _ask(raycast, len(a.poses), a, e, _places(a), a.poses[:, :3, 0].copy(), 4.0),
     "within": lambda a, e: _ask(within, len(a.poses), a, e, _places(a), a.reach),
     "objects": _objects,

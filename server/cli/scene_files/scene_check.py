@@ -1,7 +1,7 @@
 """Checks and description of a scene file, for `solidcloud scene check`."""
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +13,12 @@ from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_
 from ...archives.masked_store import MaskedStore
 from ...archives.rigid_transform import transform_boxes
 from ...archives.scene_info import run_order
-from ...scenes.scene_archives import (
+from ...scene_archives import (
     FoundArchive,
     FoundAvatar,
-    ReadPoints,
     error_location,
     find_archives,
     read_avatars,
-    store_opener,
 )
 
 # The origin of an avatar that stands on the highest point may be this far above it [m].
@@ -30,7 +28,7 @@ _STANDING_HEIGHT = 3.0
 class Checked(NamedTuple):
     """A valid scene file.
 
-    left_out: number of scan points removed by the effect `through`.
+    archives: closed.  left_out: number of scan points removed by the effect `through`.
     notes: sentences about settings that are valid but possibly unintended.
     """
 
@@ -43,7 +41,7 @@ class Checked(NamedTuple):
     notes: list[str]
 
 
-def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Checked:
+def check_scene_file(path: Path) -> Checked:
     """Read a scene file and everything it names.
 
     Raises the same errors as `Scene.open`, except those about budgets, and CorruptError or OSError
@@ -51,9 +49,10 @@ def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Check
     """
     file = read_scene(path)
     name = scene_name(file, path)
-    archives = find_archives(file, path)
-    avatars = read_avatars(file, path, read_points)
-    left_out = _removed_points(file, path, archives)
+    with ExitStack() as stack:
+        archives = find_archives(file, path, stack)
+        avatars = read_avatars(file, path)
+        left_out = _removed_points(path, archives)
     return Checked(path, name, file, archives, avatars, left_out, list(_notes(file, archives, left_out)))
 
 
@@ -67,7 +66,7 @@ def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
         models = ", ".join(info.radius_models)
         yield (
             "archive",
-            f"{found.folder}: {info.points:,} points in {info.voxels:,} voxels, radii {models}{posed}",
+            f"{found.store.archive.folder}: {info.points:,} points in {info.voxels:,} voxels, radii {models}{posed}",
         )
     yield "up", _numbers(up_of(file))
     yield "radius model", file.radius_model or "the radius stored in each archive"
@@ -109,7 +108,11 @@ def scene_json(checked: Checked) -> dict[str, Any]:
         "name": checked.name,
         "scene": msgspec.to_builtins(checked.file),
         "archives": [
-            {"folder": str(found.folder), "points": found.info.points, "voxels": found.info.voxels}
+            {
+                "folder": str(found.store.archive.folder),
+                "points": found.info.points,
+                "voxels": found.info.voxels,
+            }
             for found in checked.archives
         ],
         "avatars": [{"file": str(a.file), **msgspec.to_builtins(a.info)} for a in checked.avatars],
@@ -119,16 +122,13 @@ def scene_json(checked: Checked) -> dict[str, Any]:
     }
 
 
-def _removed_points(file: SceneFile, path: Path, archives: list[FoundArchive]) -> int:
+def _removed_points(path: Path, archives: list[FoundArchive]) -> int:
     """Return the number of scan points that the effect `through` removes."""
     left_out = 0
     for number, found in enumerate(archives):
-        with (
-            error_location(path, f"$.archives[{number}]"),
-            closing(store_opener(file, number)(found.folder)) as store,
-        ):
-            if isinstance(store, MaskedStore):
-                left_out += store.count_hidden()
+        if isinstance(found.store, MaskedStore):
+            with error_location(path, f"$.archives[{number}]"):
+                left_out += found.store.count_hidden()
     return left_out
 
 
@@ -141,9 +141,9 @@ def _notes(file: SceneFile, archives: list[FoundArchive], left_out: int) -> Iter
             yield "no scan point lies in a box of `through`: are the boxes in world coordinates, in metres?"
         if isinstance(effect, Uncertainty) and effect.scans:
             for found in archives:
-                if not found.keeps_scan:
+                if not found.store.archive.header.scan_index:
                     yield (
-                        f"{found.folder} does not store the scan of its points (build --keep scan): "
+                        f"{found.store.archive.folder} does not store the scan of its points (build --keep scan): "
                         "one sigma applies to all points"
                     )
     names = {effect_name(effect) for effect in file.effects}

@@ -4,7 +4,7 @@ import errno
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -21,8 +21,8 @@ from ....schemas.wire.key_expressions import check_name
 from ...archives.scene_info import describe
 from ...residency.voxel_store import VoxelStore
 from ...scene import DEFAULT_BUDGET, Scene
+from ...scene_archives import find_archives, open_archives, read_avatars
 from ...scene_interface import AvatarShape
-from ...scenes.scene_archives import ReadPoints, find_archives, open_archives, read_avatars
 from .scene_text import SceneContent, scene_text
 from .spawn_search import CLEARANCE, add_body, find_spawn
 
@@ -42,13 +42,12 @@ def new_scene(
     effects: Sequence[str],
     name: str | None = None,
     overwrite: bool = False,
-    read_points: ReadPoints | None = None,
     avatar_options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Sequence[float] | None:
     """Write a scene file with archives, avatars named after their files, effects, and a spawn.
 
     Returns the position of the spawn, None if no place for it was found.
-    overwrite: replace an existing file.  read_points: as for `Scene.open`.
+    overwrite: replace an existing file.
     avatar_options: fields of all avatars, besides name and file.
     Raises BadRequestError for content that a scene file must not have and for an existing file,
     FormatError or CorruptError for an invalid archive, ScanError for an invalid avatar.
@@ -86,7 +85,7 @@ def new_scene(
     if not out.absolute().parent.is_dir():
         error = FileNotFoundError(errno.ENOENT, "")
         raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}")
-    spawn, note = _find_spawn(parsed, out, called, read_points)
+    spawn, note = _find_spawn(parsed, out, called)
     text = scene_text(begin._replace(spawn=spawn, spawn_note=note)).encode()
     try:
         with new_file(out) as file:
@@ -96,25 +95,24 @@ def new_scene(
     return spawn
 
 
-def _find_spawn(
-    file: SceneFile, out: Path, name: str, read_points: ReadPoints | None
-) -> tuple[Sequence[float] | None, str]:
+def _find_spawn(file: SceneFile, out: Path, name: str) -> tuple[Sequence[float] | None, str]:
     """Return a position where the avatars of a scene file stand, if one is found, and a note on it.
 
     Without avatars, a generated figure takes their place.
     """
-    found = find_archives(file, out)
-    given = {each.info.name: each.shape for each in read_avatars(file, out, read_points)}
-    who = ", ".join(given)
-    if not given:
-        given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"
-    try:
-        archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
-        with Scene(archives, name) as scene:
-            spawn = find_spawn(scene, add_body(scene, given))
-    except SolidcloudError as error:
-        words = "".join(each if each.isprintable() else " " for each in str(error))
-        return None, f"No place to stand could be searched: {words}."
+    with ExitStack() as stack:
+        found = find_archives(file, out, stack)
+        given = {each.info.name: each.shape for each in read_avatars(file, out)}
+        who = ", ".join(given)
+        if not given:
+            given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"
+        try:
+            archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
+            with Scene(archives, name) as scene:
+                spawn = find_spawn(scene, add_body(scene, given))
+        except SolidcloudError as error:
+            words = "".join(each if each.isprintable() else " " for each in str(error))
+            return None, f"No place to stand could be searched: {words}."
     if spawn is None:
         return None, f"No place near the middle was found where {who} would stand clear on a floor."
     return spawn, f"Tried when this file was written: {who} clear, {CLEARANCE:g} m above a floor."

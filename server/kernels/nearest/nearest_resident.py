@@ -2,7 +2,7 @@
 
 It applies where the resident voxels suffice: all in the pose's reach, or all that can hold a pair
 nearer than the one found. The kernel also converts the nearest
-pair to metres, with the formulas of `signed_distance.py` in the same order of operations; the bits
+pair to metres, with the formulas of `queries/distance.py` in the same order of operations; the bits
 are therefore the same. As numpy operations on columns of one element, this took four times as long
 as the search.
 """

@@ -13,7 +13,7 @@ scene declares, in this order:
 
 `through` does nothing in a frame: it changes the scene once, when it is opened.
 
-May import server.archives, server.avatars, server.queries, server.queries.context,
-server.residency, server.runtime, server.simulation.world, schemas.
+May import server.archives, server.avatars, server.queries, server.residency, server.runtime,
+server.simulation.world, schemas.
 Begin with effect_pipeline.py, then stop_effect.py.
 """

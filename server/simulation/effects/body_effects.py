@@ -32,8 +32,8 @@ from ....schemas.scene.effect_table import Crowd, Objects
 from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
-from ...queries.context.query_budget import QueryBudget
-from ...queries.context.query_context import to_units
+from ...queries.request import QueryBudget
+from ...queries.scene_data import to_units
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
 from ..world.body_obstacles import BodyObstacle, warm_kernels
 from ..world.frame import Frame, Hit, Pose, Vec, lowest_height, translated

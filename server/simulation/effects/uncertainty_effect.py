@@ -40,9 +40,9 @@ from ....schemas.wire.motion_messages import UncertaintyReport
 from ....schemas.wire.scene_messages import SceneInfo, SourceInfo
 from ...archives.rigid_transform import transform_poses
 from ...avatars.avatar_model import make_avatar
-from ...queries.context.query_context import SceneData
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
 from ...queries.resident_fast_path import distance_fast
+from ...queries.scene_data import SceneData
 from ..world.frame import Frame
 from .report_effects import is_farther_than, nearest
 

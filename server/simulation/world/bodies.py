@@ -21,7 +21,7 @@ from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.walk.walk_bodies import refer_to_bodies
-from ...queries.context.query_context import to_units
+from ...queries.scene_data import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Pose, Vec
 from .vectors import horizontal, rotate, rotate_back

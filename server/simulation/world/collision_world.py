@@ -23,9 +23,9 @@ from ...archives.rigid_transform import rotate_vectors, transform_points, transf
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...queries.contacts import contacts
-from ...queries.context.query_budget import EXACT, QueryBudget
-from ...queries.context.query_context import SceneData, with_stop
+from ...queries.request import EXACT, QueryBudget
 from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
+from ...queries.scene_data import SceneData, with_stop
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY

@@ -22,7 +22,7 @@ from ...kernels.motion.sweep_resident import AVATAR, CLOUD, END, ENDED, LOWER, P
 from ...kernels.walk import walk_state as state
 from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
-from ...queries.context.query_budget import EXACT
+from ...queries.request import EXACT
 from ...queries.resident_fast_path import MAX_FAST_VOXELS
 from .collision_world import SPARSE_FACTOR, World, normals_of
 from .frame import (

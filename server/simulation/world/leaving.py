@@ -14,8 +14,7 @@ from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
 from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
-from ...queries.context.query_budget import QueryBudget
-from ...queries.context.query_context import parts_that_fit
+from ...queries.request import QueryBudget, parts_that_fit
 from .collision_world import HeldArchive, to_archive, to_world
 from .frame import (
     Frame,
@@ -106,7 +105,7 @@ class LeavingPose:
         low, high = shift - heights[:3] - more, shift + heights[3:] + more
         box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
         nothing = np.empty((0, kernel.GATHERED))
-        if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
+        if data.nothing_clear or _meets(box, tree.unknown[:, 0], tree.unknown[:, 1]).any():
             return _Gathered(nothing, True)
         rows = np.flatnonzero(_meets(box, tree.low[: tree.voxels], tree.high[: tree.voxels])).tolist()
         held = data.references.to(arrays, tree)

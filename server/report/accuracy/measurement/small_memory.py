@@ -58,7 +58,7 @@ def _walk(archive: Path, avatar: Floats, poses: Floats, truly: np.ndarray, row: 
         return row._replace(note="the largest voxel does not fit")
     with scene:
         with scene.archives[0].take() as opened:
-            if row.kind == "bounds" and not opened.has_level:
+            if row.kind == "bounds" and opened.level is None:
                 return row._replace(note="the largest voxel of the level of detail does not fit")
         scene.add_avatar(AVATAR, avatar)
         drop_cache(archive)

@@ -252,9 +252,6 @@ def test_a_mesh_of_a_scene_file_is_solid(scene: Scene, tmp_path: Path) -> None:
     with Scene.open(file) as opened:
         assert opened.info().avatars[0].description.startswith("mesh, hollow: a surface")
         assert opened.info().avatars[0].description.endswith("; y up, unit cm")
-    with Scene.open(file, read_points=lambda _: POINTS) as opened:
-        found = opened.info().avatars[0]
-        assert (found.points, found.radius) == (len(POINTS), 0.04)
 
 
 def test_a_file_of_a_scene_without_points_is_refused_with_its_place(scene: Scene, tmp_path: Path) -> None:

@@ -107,31 +107,29 @@ def test_the_same_avatar_again_is_the_same_and_another_is_refused():
     assert avatars.stats().avatars == 2
 
 
-def test_what_is_being_built_counts_and_is_waited_for(monkeypatch):
-    avatars, begun, go = Avatars(LIMITS), threading.Event(), threading.Event()
+def test_of_two_that_are_built_at_a_time_one_is_stored_within_the_limits(monkeypatch):
+    avatars, together = Avatars(LIMITS._replace(avatars_by_client=1)), threading.Barrier(3)
 
     def slowly(points, radius, inner_points=0):
-        begun.set()
-        assert go.wait(20)
+        together.wait(20)
         return make_avatar(points, radius)
 
     monkeypatch.setattr(avatars_module, "make_avatar", slowly)
-    made = []
-    threads = [
-        threading.Thread(target=lambda: made.append(avatars.add("al", BODY, 0.01, "a"))) for _ in range(2)
-    ]
+    made, refused = [], []
+
+    def add(name):
+        try:
+            made.append(avatars.add(name, BODY, 0.01, "a"))
+        except TooLargeError as error:
+            refused.append(str(error))
+
+    threads = [threading.Thread(target=add, args=(name,)) for name in ("al", "al", "bo")]
     for thread in threads:
         thread.start()
-    assert begun.wait(20)
-    assert avatars.stats().avatars == 1 and avatars.stats().bytes >= BODY.nbytes
-    with pytest.raises(UnknownAvatarError):
-        avatars.get("al", "a")
-    with pytest.raises(TooLargeError):
-        avatars.add("bo", np.zeros((700, 3)), 0.01, "a")
-    go.set()
     for thread in threads:
         thread.join(20)
-    assert len(made) == 2 and made[0] is made[1] is avatars.get("al", "a")
+    assert len(made) + len(refused) == 3 and len({id(model) for model in made}) == 1
+    assert avatars.stats().avatars == 1 and all("1 avatars of this client exist" in each for each in refused)
 
 
 def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):

@@ -19,7 +19,7 @@ from solidcloud.server.archives.scene_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_context import make_scene_data
+from solidcloud.server.queries.scene_data import make_scene_data
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 
@@ -147,9 +147,9 @@ def test_a_voxel_that_cannot_be_read_is_not_exact(tmp_path: Path, rng: np.random
 @pytest.mark.interpreted
 def test_where_a_scan_was_left_out_nothing_is_exact(row: ScanCase) -> None:
     """A region x >= 2 m is unknown; and then everywhere is."""
-    region = np.array([[[2000, -9, -9], [9000, 9, 9]]])
+    region = np.array([[[2000.0, -9, -9], [9000, 9, 9]]])
     poses = at((0.5, 0, 0), (0.55, 0.1, 0), (2.1, 0, 0), (2.15, 0.04, 0))
-    answers = contacts(row.data._replace(unknown=region), BALL, poses)
+    answers = contacts(row.data._replace(tree=row.data.tree._replace(unknown=region)), BALL, poses)
     assert answers.verdict.tolist() == [CONTACT, CLEAR, CONTACT, UNKNOWN]
     assert answers.exact.tolist() == [True, True, False, False]
     everywhere = row.data._replace(unknown_everywhere=True)

@@ -16,9 +16,9 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.queries.context.query_budget import EXACT, make_budget
-from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.request import EXACT, make_budget
+from solidcloud.server.queries.scene_data import SceneData, make_scene_data
 from solidcloud.server.queries.within import within
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore

@@ -13,9 +13,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import resident_fast_path as module
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import EXACT, make_budget
-from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.request import EXACT, make_budget
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
+from solidcloud.server.queries.scene_data import SceneData
 from solidcloud.server.queries.sweep import sweep
 
 Poses = NDArray[np.float64]
@@ -32,7 +32,7 @@ def same(
         one = probe.sweep(data, first[i], last[i], tolerance, EXACT)
         assert one.verdict == answers.verdict[i] and one.visits == answers.node_visits[i]
         assert (one.lower, one.upper, one.exact) == (answers.lower[i], answers.upper[i], answers.exact[i])
-        if not data.nothing_clear and not len(data.unknown):
+        if not data.nothing_clear and not len(data.tree.unknown):
             assert one.unknown == (one.verdict == Verdict.UNKNOWN or one.missing > 0)
         if one.verdict == Verdict.CONTACT:
             np.testing.assert_array_equal(one.avatar, answers.witness_avatar[i])
@@ -86,7 +86,7 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
         unseen, region = data._replace(unknown_everywhere=True), np.array([[[-(10**6)] * 3, [10**6] * 3]])
         tree = data.tree._replace(unknown=region.astype(np.float64))
-        for seen in (unseen, data._replace(unknown=region, tree=tree)):
+        for seen in (unseen, data._replace(tree=tree)):
             assert {each.verdict for each in same(probe, seen, first, last)} <= {
                 Verdict.UNKNOWN,
                 Verdict.CONTACT,

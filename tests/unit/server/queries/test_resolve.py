@@ -1,6 +1,5 @@
 """The one way to the voxels: rounds that fit in the cache, what is absent, late, settled or stopped."""
 
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +8,7 @@ import pytest
 from fake_store import BLOCK, FakeStore
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from solidcloud.server.queries.context.query_budget import EXACT, CostCounter, LateVoxels, QueryBudget
+from solidcloud.server.queries.request import EXACT, CostCounter, LateVoxels, QueryBudget
 from solidcloud.server.queries.resolve import (
     Steps,
     drop_entries,
@@ -46,9 +45,11 @@ class Table:
         self.store = FakeStore(sizes)
         self.residency = VoxelCache(self.store, blocks * BLOCK)  # type: ignore[arg-type]
         self.data: Any = SimpleNamespace(
-            residency=self.residency, arrays=SimpleNamespace(where=self.residency.where)
+            residency=self.residency,
+            arrays=SimpleNamespace(where=self.residency.where),
+            keys=np.arange(len(sizes)).astype(np.uint64),
         )
-        self.spent = CostCounter(time.perf_counter(), self.residency, np.arange(len(sizes)).astype(np.uint64))
+        self.spent = CostCounter(self.data)
         self.seen: dict[int, list[tuple[int, int]]] = {}
         self.calls: list[tuple[list[int], list[int]]] = []
         self.ends: dict[int, int] = {}

@@ -15,9 +15,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
-from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.request import QueryBudget, make_budget
+from solidcloud.server.queries.scene_data import SceneData
 from solidcloud.server.queries.sweep import sweep
 
 pytestmark = pytest.mark.interpreted
@@ -28,7 +28,9 @@ QUESTIONS: dict[str, Callable[..., Any]] = {
     "collide": lambda data, avatar, poses, budget: collide(data, avatar, poses, 0.0, budget),
     "distance": lambda data, avatar, poses, budget: distance(data, avatar, poses, 0.1, budget),
     "contacts": lambda data, avatar, poses, budget: contacts(data, avatar, poses, budget=budget),
-    "sweep": lambda data, avatar, poses, budget: sweep(data, avatar, poses, poses, budget=budget),
+    "sweep": lambda data, avatar, poses, budget: sweep(
+        data, avatar, poses, poses, tolerance=1e-6, budget=budget
+    ),
 }
 
 

@@ -92,7 +92,7 @@ def test_coarse_details_are_read_from_the_level(
     rows = zip(np.rint(truth.xyz * 1e3).astype(int).tolist(), truth.rgb.tolist(), truth.classes, strict=True)
     expected = {(*place, *rgb, int(kind)) for place, rgb, kind in rows}
     with Scene.open(folder) as scene, scene.archives[0].take() as opened:
-        level = opened.level_archive
+        level = opened.level and opened.level.store.archive
         assert level is not None
         monkeypatch.setattr(opened.store.archive, "read_voxel", None)
         found, counts = set(), [0] * 6

@@ -209,7 +209,7 @@ def test_what_is_perhaps_not_meant_is_noted(
         (
             TOP + '[[effects]]\neffect = "through"\n'
             'boxes = [{name = "all", low = [-1e8, -1e8, -1e8], high = [1e8, 1e8, 1e8]}]\n', 2,
-            "hall.toml: $.archives[0]: {folder}/scans/hall: the boxes of the effect `through` contain all of",
+            "hall.toml: $.archives[0].path: {folder}/scans/hall: the boxes of the effect `through` contain all of",
         ),
     ],
 )  # fmt: skip

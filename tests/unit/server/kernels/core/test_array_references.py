@@ -6,7 +6,7 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
-from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.queries.request import EXACT
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, distance_fast
 from solidcloud.server.scene import Scene
 

@@ -10,7 +10,7 @@ from moving_bodies import INTERPRETED, at, staged, touch
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.queries.request import EXACT
 from solidcloud.server.runtime.stop_flag import StopFlag as Ending
 from solidcloud.server.runtime.stop_flag import StoppedError
 from solidcloud.server.simulation.world.bodies import Bodies

@@ -11,7 +11,7 @@ from solidcloud.schemas.scene.effect_table import AnyEffect, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.kernels.walk.walk_state import FOLLOW
-from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.queries.request import EXACT
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame

@@ -1,4 +1,4 @@
-"""Budget and cost of a query, and the answer of a query that was stopped.
+"""Request of a query: its budget and cost, its checks, and the voxels in reach of its poses.
 
 Every query takes a `QueryBudget`. Without a deadline the work ends when the answer is exact, or
 known within the tolerance. A deadline is a stop flag that is set at that time: the same kernels end,
@@ -7,20 +7,26 @@ and the answer is still correct. See NUMERICS.md case 30.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.errors import BadRequestError
-from ....schemas.wire.answers import Cost
-from ....schemas.wire.question_rules import Question
-from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...residency.voxel_cache import HeldVoxels, VoxelCache
-from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
+from ...schemas.archive.pose_arrays import make_poses
+from ...schemas.archive.rigid_pose import RENORMALISE
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from ...schemas.wire.answers import Cost
+from ...schemas.wire.question_rules import Question
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.core import voxels_in_reach as pose_checks
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
+from ..kernels.core.voxels_in_reach import VoxelsInReach, check_poses, find_reach, make_reach
+from ..residency.voxel_cache import HeldVoxels, VoxelCache
+from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
+from .scene_data import SceneData
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -29,6 +35,36 @@ LOAD_SHARE = 0.5
 # Where a share of the distance is allowed, this is allowed at any distance: near contact a share
 # would be less than the lattice resolves [m].
 LEAST_RELATIVE = 1e-3
+# Limit on the voxels in reach of one request, summed over its poses: 128 MB of row numbers. Without
+# it, 100,000 poses with thousands of voxels in reach each would take gigabytes.
+MAX_ROWS = 1 << 24
+_POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
+    pose_checks.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
+    pose_checks.BAD_LAST_ROW: (
+        BadTransformError,
+        "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
+    ),
+    pose_checks.MIRRORED: (BadTransformError, "mirrors (determinant {:g}): expected a rotation"),
+    pose_checks.SHEARED: (
+        BadTransformError,
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, within 1e-9: "
+        f"{RENORMALISE}",
+    ),
+    pose_checks.SCALED: (
+        BadTransformError,
+        "scales by {0:.10g}: expected a rigid pose, within 1e-9: add a scaled avatar, "
+        f"add_avatar(..., scale={{0:.10g}}), or remove the scale: {RENORMALISE}",
+    ),
+    pose_checks.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
+    pose_checks.LONG_REACH: (
+        BadRequestError,
+        "has radii and margin, or reach, that add up to {:g} m: expected at most 16 m: give a smaller one",
+    ),
+    pose_checks.LARGE_AVATAR: (
+        TooLargeError,
+        "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
+    ),
+}
 
 
 class LateVoxels:
@@ -54,8 +90,6 @@ class QueryBudget(NamedTuple):
     deadline: on time.perf_counter()'s clock [s], inf for none. It sets `stop`.
     scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
     the cache (eviction.py).
-    share: share of the cache for the voxels held at a time. If not all fit, work counts depend on
-    it; verdicts never do.
     stop: ends the work early once it is set; what was not examined by then is unknown.
     request: the flag of the whole request, which its deadline does not set: for its broad phase.
     late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such
@@ -65,7 +99,6 @@ class QueryBudget(NamedTuple):
     tolerance: float = 0.0
     deadline: float = math.inf
     scan: bool = False
-    share: float = 1.0
     stop: StopFlag = NO_STOP
     relative: float = 0.0
     late: LateVoxels | None = None
@@ -128,28 +161,21 @@ def make_budget(
     if budget_ms is not None and not 0 <= budget_ms < math.inf:
         raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
     budget = QueryBudget(float(tolerance), stop=stop, relative=float(relative_tolerance), request=stop)
-    return budget if budget_ms is None else with_deadline(budget, time.perf_counter() + budget_ms / 1e3)
-
-
-def with_deadline(budget: QueryBudget, deadline: float) -> QueryBudget:
-    """Return the same budget with this deadline, on time.perf_counter()'s clock [s]."""
-    stop = budget.request.part()
-    stop_at(stop, deadline, "")
-    return budget._replace(deadline=deadline, stop=stop)
+    if budget_ms is None:
+        return budget
+    budget = budget._replace(deadline=time.perf_counter() + budget_ms / 1e3, stop=stop.part())
+    stop_at(budget.stop, budget.deadline, "")
+    return budget
 
 
 class CostCounter:
     """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
 
-    __slots__ = ("_keys", "_residency", "begin", "faults", "hits", "late", "loaded", "misses", "waited")
+    __slots__ = ("_begin", "_keys", "_residency", "faults", "hits", "late", "loaded", "misses", "waited")
 
-    def __init__(self, begin: float, residency: VoxelCache, keys: NDArray[np.uint64]) -> None:
-        """Begin with zero cost.
-
-        begin: start time on time.perf_counter()'s clock [s].  keys: (v,) of the voxels, by their
-        row in the index.
-        """
-        self.begin, self._residency, self._keys = begin, residency, keys
+    def __init__(self, data: SceneData) -> None:
+        """Begin now with zero cost. data: of the scene that is queried."""
+        self._begin, self._residency, self._keys = time.perf_counter(), data.residency, data.keys
         self.hits = self.misses = 0
         self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
         self.waited = 0.0
@@ -170,10 +196,6 @@ class CostCounter:
         rows = [int(self._keys.searchsorted(key)) for key in cost.late]
         self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
 
-    def of_level(self, residency: VoxelCache) -> "CostCounter":
-        """Return a counter for a query of the level of the same scene, for `add_level`."""
-        return CostCounter(self.begin, residency, self._keys)
-
     def add_level(self, cost: "CostCounter") -> None:
         """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
         self.waited += cost.waited
@@ -182,7 +204,7 @@ class CostCounter:
     def fields(self) -> dict[str, Any]:
         """Return the fields of `Cost`; call it when the answer is complete."""
         return {
-            "engine_seconds": time.perf_counter() - self.begin,
+            "engine_seconds": time.perf_counter() - self._begin,
             "hits": self.hits,
             "misses": self.misses,
             "resident": self._residency.resident,
@@ -206,3 +228,88 @@ def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
     """Return `Question.unknown` for the k items of a stopped request, with the reason."""
     answers = question.unknown(k, bounded=budget.tolerance > 0.0)
     return structs.replace(answers, stopped=budget.stopped)
+
+
+def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    """Return poses, (4, 4) or (k, 4, 4), in a writable array (k, 4, 4). Raise BadRequestError.
+
+    numba would compile the kernels again for a read-only array.
+    """
+    array = make_poses(poses)
+    return array if array.flags.writeable else array.copy()
+
+
+def refuse(fault: int, pose: int, found: float) -> None:
+    """Raise the error for a fault reported by `find_reach`; do nothing if there is none."""
+    if fault != pose_checks.VALID:
+        error, text = _POSE_FAULTS[fault]
+        raise error(f"pose {pose} {text.format(found)}")
+
+
+def check_avatar(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    other_units: int,
+    numbers: NDArray[np.int64] | None = None,
+) -> NDArray[np.int64]:
+    """Check poses (k, 4, 4) of an avatar; return the reach (k,) of each, the avatar's radius plus other_units.
+
+    other_units: in exact units.  numbers: (k,) of the poses in the request, for messages; None: their rows.
+    A stop may leave some reaches zero. Raise BadRequestError, BadTransformError or TooLargeError.
+    """
+    units = np.zeros(len(poses), np.int64)
+    fault, pose, found = check_poses(
+        poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, units
+    )
+    refuse(fault, pose if numbers is None else int(numbers[pose]), found)
+    return units
+
+
+def check_request(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
+) -> VoxelsInReach:
+    """Check poses (k, 4, 4) and return the voxels in reach of each; none for an empty avatar.
+
+    Raise BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for
+    more than MAX_ROWS voxels in reach of all poses, and StoppedError.
+    """
+    needed = 16 * len(poses) + 64
+    while True:
+        reach = make_reach(len(poses), needed)
+        fault, pose, found, needed = find_reach(
+            poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.tree, reach
+        )
+        refuse(fault, pose, found)
+        if needed < 0:
+            raise StoppedError
+        if needed <= len(reach.lists.rows):
+            return reach
+        if needed > MAX_ROWS:
+            raise TooLargeError(
+                f"{needed} voxels in reach of {len(poses)} poses: at most {MAX_ROWS} in a request: ask about fewer "
+                "poses, or with a smaller margin or reach"
+            )
+
+
+def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
+    """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
+    part: list[int] = []
+    taken = 0
+    for row in rows:
+        size = residency.bytes_of([row])
+        if part and taken + size > budget_bytes:
+            yield part
+            part, taken = [], 0
+        part.append(row)
+        taken += size
+    if part:
+        yield part
+
+
+def unseen_from(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
+    """Return lower bounds (k,) of the distance of centres from scans that the build left out [steps].
+
+    inf: no such scan is in reach. Call it after all loads: one may have proved the index wrong.
+    """
+    return np.zeros(len(reach.units)) if data.nothing_clear else reach.lists.unseen

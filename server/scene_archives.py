@@ -13,40 +13,31 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ...schemas.archive.radius_model import class_radii
-from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
-from ...schemas.scene.scene_file import SUFFIX, SceneFile
-from ...schemas.wire.requests import make_positions
-from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
-from ..archives.placed_archive import PlacedArchive
-from ..archives.scene_info import describe
-from ..avatars.avatar_model import describe_avatar, make_avatar
-from ..avatars.avatar_shape import avatar_shape
-from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..residency.arena import ArenaBuffer
-from ..residency.voxel_store import OpenStore, VoxelStore
-from ..scene_interface import AvatarShape
+from ..schemas.archive.radius_model import class_radii
+from ..schemas.archive.units import UNITS_PER_METRE
+from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
+from ..schemas.scene.scene_file import SUFFIX, SceneFile
+from ..schemas.wire.scene_messages import AvatarInfo, SceneInfo
+from .archives.placed_archive import PlacedArchive
+from .archives.scene_info import describe
+from .avatars.avatar_model import describe_avatar, make_avatar
+from .avatars.avatar_shape import avatar_shape
+from .kernels.core.placed_avatar import MAX_REACH_UNITS
+from .residency.arena import ArenaBuffer
+from .residency.voxel_store import OpenStore, VoxelStore
+from .scene_interface import AvatarShape
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/world/bodies.py).
 MAX_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
-ReadPoints = Callable[[Path], NDArray[np.float64]]
-
 
 class FoundArchive(NamedTuple):
-    """Archive that a scene file names, described before it is opened.
+    """Archive that a scene file names. store: opened.  info: its description."""
 
-    info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
-    keeps_scan: whether it stores the scan of each point.
-    """
-
-    folder: Path
+    store: VoxelStore
     info: SceneInfo
-    sizes: NDArray[np.int64]
-    keeps_scan: bool
 
 
 class FoundAvatar(NamedTuple):
@@ -62,46 +53,38 @@ def is_scene_file(path: Path) -> bool:
     return path.suffix == SUFFIX and not path.is_dir()
 
 
-def find_archives(file: SceneFile, path: Path) -> list[FoundArchive]:
-    """Return the archives that a scene file names, after checking their indexes.
+def find_archives(file: SceneFile, path: Path, stack: ExitStack) -> list[FoundArchive]:
+    """Open the archives that a scene file names; check that each stores what the scene file requires.
 
-    Also checks that each archive stores what the scene file requires.
-    path: of the scene file, for errors and for relative paths.
-    Raises FormatError, CorruptError or BadRequestError.
+    path: of the scene file, for errors and for relative paths.  stack: closes the archives.
+    Raise FormatError, CorruptError or BadRequestError.
     """
     found = []
     for number, item in enumerate(file.archives):
         with error_location(path, f"$.archives[{number}].path"):
-            store = VoxelStore(_resolve_relative(path, item.path))
-        try:
-            header = store.archive.header
-            if file.radius_model is not None:
-                with error_location(path, f"$.radius_model: {store.archive.folder}"):
-                    class_radii(file.radius_model, header.radius, header.models)
-            info = describe(store, store.archive.folder.name)
-            found.append(FoundArchive(store.archive.folder, info, store.sizes, header.scan_index))
-        finally:
-            store.close()
+            store = store_opener(file, number)(_resolve_relative(path, item.path))
+        stack.callback(store.close)
+        header = store.archive.header
+        if file.radius_model is not None:
+            with error_location(path, f"$.radius_model: {store.archive.folder}"):
+                class_radii(file.radius_model, header.radius, header.models)
+        found.append(FoundArchive(store, describe(store, store.archive.folder.name)))
     _check_noise(file, path, found)
     return found
 
 
-def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints | None) -> list[FoundAvatar]:
-    """Return the avatars that a scene file names.
-
-    read_points: reads the points of a file; None: files are read as by `Scene.add_avatar`.
-    Raises BadRequestError and the errors of `read_points` or `avatar_shape`.
-    """
+def read_avatars(file: SceneFile, path: Path) -> list[FoundAvatar]:
+    """Return the avatars that a scene file names. Raise BadRequestError and the errors of `avatar_shape`."""
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
         avatar_file = _resolve_relative(path, item.file)
         with error_location(path, f"$.avatars[{number}].file"):
-            source = avatar_file if read_points is None else read_points(avatar_file)
-            given = {} if read_points else {"up": item.up, "units": item.units}
-            shape = avatar_shape(source, item.radius, scale=item.scale, hollow=item.hollow, **given)
+            shape = avatar_shape(
+                avatar_file, item.radius, up=item.up, units=item.units, scale=item.scale, hollow=item.hollow
+            )
         with error_location(path, f"$.avatars[{number}]"):
-            model = make_avatar(make_positions(shape.points), shape.radius, shape.inner_points)
+            model = make_avatar(shape.points, shape.radius, shape.inner_points)
             if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
@@ -119,7 +102,7 @@ def store_opener(file: SceneFile, number: int) -> OpenStore:
     """
     for effect in file.effects:
         if isinstance(effect, Through):
-            from ..simulation.effects.through_effect import store_without
+            from .simulation.effects.through_effect import store_without
 
             return store_without(effect, file.archives[number].pose)
     return VoxelStore
@@ -156,25 +139,26 @@ def open_archives(
     took: Callable[[float], None],
     level_bytes: int | None = None,
 ) -> list[PlacedArchive]:
-    """Open the archives of a scene, which the caller closes.
+    """Place the archives of a scene, which the caller closes.
 
-    name: of the scene.  budget_bytes: limit of decoded voxels, all archives together.
+    name: of the scene.  found: by `find_archives`.  budget_bytes: limit of decoded voxels, all archives together.
     policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
     [s].  level_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """
     with error_location(path, "$.archives"):
-        budgets = share_budget(budget_bytes, [each.sizes for each in found])
+        budgets = share_budget(budget_bytes, [each.store.sizes for each in found])
     opened: list[PlacedArchive] = []
     with ExitStack() as stack:
         for number, (each, budget, item) in enumerate(zip(found, budgets, file.archives, strict=True)):
             with error_location(path, f"$.archives[{number}]"):
                 archive = PlacedArchive(
-                    each.folder,
+                    each.store.archive.folder,
                     name,
                     budget_bytes=budget,
                     policy=policy,
                     open_store=store_opener(file, number),
+                    store=each.store,
                     radius_model=file.radius_model,
                     pose=item.pose,
                     took=took,
@@ -202,7 +186,7 @@ def _check_noise(file: SceneFile, path: Path, found: list[FoundArchive]) -> None
     """Raise BadRequestError if the effect `uncertainty` names a scan that no archive lists."""
     for number, effect in enumerate(file.effects):
         if isinstance(effect, Uncertainty):
-            from ..simulation.effects.uncertainty_effect import check
+            from .simulation.effects.uncertainty_effect import check
 
             sources = [source for each in found for source in each.info.sources]
             with error_location(path, f"$.effects[{number}]"):

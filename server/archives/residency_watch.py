@@ -20,10 +20,10 @@ from ...schemas.wire.residency_messages import (
     SILENT_SECONDS,
     ResidencyChanges,
 )
-from ..archives.archive_generation import ArchiveGeneration
-from ..archives.placed_archive import PlacedArchive
 from ..residency.cache_stats import ChangeLog
 from ..residency.voxel_cache import VoxelCache
+from .archive_generation import ArchiveGeneration
+from .placed_archive import PlacedArchive
 
 
 class _Followed(NamedTuple):

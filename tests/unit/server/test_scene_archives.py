@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from solidcloud.schemas.errors import (
     BadRequestError,
     FormatError,
@@ -19,23 +20,17 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ObjectInfo, SceneInfo, SpawnInfo
 from solidcloud.server import scene as scene_module
+from solidcloud.server import scene_archives
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
 from solidcloud.server.scene import Scene
-from solidcloud.server.scenes import scene_archives
 
 pytestmark = pytest.mark.interpreted
 
 TOP = 'format = 1\n[[archives]]\npath = "floor"\n'
 BALL = '[[avatars]]\nname = "ball"\nfile = "ball.xyz"\nradius = 0.05\n'
 STOP = '[[effects]]\neffect = "stop"\n'
-
-
-def read_points(path: Path) -> np.ndarray:
-    if not path.exists():
-        raise ScanError(f"{path}: no such file")
-    return np.loadtxt(path, ndmin=2)
 
 
 def at(*places: tuple[float, float, float]) -> np.ndarray:
@@ -71,11 +66,11 @@ def write(folder: Path) -> Write:
 
 
 def test_an_archive_is_itself_and_stop(folder: Path) -> None:
-    with Scene.open(folder / "floor", read_points=read_points) as scene:
+    with Scene.open(folder / "floor") as scene:
         assert isinstance(scene, Scene) and scene.name == "floor"
         info = scene.info()
         assert info.effects == ["stop"] and info.avatars == [] and info.spawn is None and info.up == (0, 0, 1)
-    with Scene.open(folder / "floor", read_points=read_points, name="hall") as scene:
+    with Scene.open(folder / "floor", name="hall") as scene:
         assert scene.name == "hall"
 
 
@@ -85,11 +80,12 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
         + '[[objects]]\nname = "b"\navatar = "ball"\nkind = "pushed"\npose = [[1, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5],'
         ' [0, 0, 0, 1]]\n[[effects]]\neffect = "objects"\n[spawn]\nposition = [0, 0, 2]\nheading = 90\n'
     )  # fmt: skip
-    with Scene.open(write(text), read_points=read_points) as scene:
+    with Scene.open(write(text)) as scene:
         assert scene.name == "hall"
         info = scene.info()
         assert info.scene == "hall" and info.effects == ["objects", "stop"] and info.up == (0, 0, 1)
-        assert info.avatars == [AvatarInfo("ball", 1, 0.05, info.avatars[0].bounding_radius)]
+        said = "points: a surface, with nothing inside; z up, unit m"
+        assert info.avatars == [AvatarInfo("ball", 1, 0.05, info.avatars[0].bounding_radius, 0, said)]
         assert info.avatars[0].bounding_radius == pytest.approx(0.05, abs=1e-5)
         assert info.spawn == SpawnInfo((0.0, 0.0, 2.0), 90.0) and info.default_radius_model == "fixed:0.02"
         assert info.objects == [ObjectInfo("b", "ball", at((5, 5, 5))[0].tolist(), "pushed")]
@@ -110,7 +106,7 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
         (part,) = scene.path("ball", poses, client="one")
         assert part.verdict.tolist() == [Verdict.CONTACT, Verdict.CLEAR]
         same = scene.add_avatar("ball", [[0, 0, 0]], 0.05, client="one")
-        assert same == info.avatars[0]
+        assert same == structs.replace(info.avatars[0], description="")
         with pytest.raises(BadRequestError, match="'ball' exists with other points or another radius"):
             scene.add_avatar("ball", [[0, 0, 1]], 0.05, client="one")
         scene.drop_client("one")
@@ -122,7 +118,7 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
 )
 def test_several_archives_answer_as_one(write: Write, second: str) -> None:
     text = TOP + '[[archives]]\npath = "floor"\n' + second + BALL + STOP
-    with Scene.open(write(text), read_points=read_points, budget_bytes=64 << 20) as scene:
+    with Scene.open(write(text), budget_bytes=64 << 20) as scene:
         info = scene.info()
         assert (info.points, info.scene, info.effects) == (242, "hall", ["stop"])
         answers = scene.collide("ball", at((0.5, 0.5, 0.05), (9.5, 0.5, 2.05)), client="any")
@@ -142,14 +138,14 @@ def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write)
     spawn = "[spawn]\nposition = [0, 5, 1.5]\n"
     file = write(TOP + second + BALL + STOP + through + spawn)
     places = at((0, 5, 1), (0.4, 5, 1), (0, 0, 0), (0.4, 0.4, 0))
-    with Scene.open(file, read_points=read_points, policy="lru+prefetch") as scene:
+    with Scene.open(file, policy="lru+prefetch") as scene:
         expected = [Verdict.CLEAR, Verdict.CONTACT, Verdict.CONTACT, Verdict.CLEAR]
         assert scene.collide("ball", places, client="any").verdict.tolist() == expected
         assert scene.stats().policy == "lru+prefetch"
     # 25 points of the one, 9 of the other; users begin within what is scanned, but for two metres more.
-    checked = check_scene_file(file, read_points)
+    checked = check_scene_file(file)
     assert checked.left_out == 25 + 9 and not [note for note in checked.notes if "spawn" in note]
-    outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")), read_points)
+    outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")))
     assert [note for note in outside.notes if "spawn lies outside the bounds" in note]
 
 
@@ -175,11 +171,11 @@ def test_a_fault_of_what_is_named_has_the_file_and_the_place(
     folder: Path, write: Write, text: str, kind: type[Exception], said: str
 ) -> None:
     file = write(text)
-    with pytest.raises(kind) as found, Scene.open(file, read_points=read_points):
+    with pytest.raises(kind) as found, Scene.open(file):
         pass
     assert str(found.value).startswith(f"{file}: {said.format(folder)}")
     with pytest.raises(kind) as checked:
-        check_scene_file(file, read_points)
+        check_scene_file(file)
     assert str(checked.value) == str(found.value)
 
 
@@ -188,7 +184,7 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
         pytest.raises(
             BadRequestError, match=r"hall.toml: \$.archives\[0\]: cache of 10 bytes: the largest voxel"
         ),
-        Scene.open(write(TOP), read_points=read_points, budget_bytes=10),
+        Scene.open(write(TOP), budget_bytes=10),
     ):
         pass
     two = write(TOP + '[[archives]]\npath = "floor"\n')
@@ -196,7 +192,7 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
         pytest.raises(
             BadRequestError, match=r"hall.toml: \$.archives: cache of 10 bytes: the largest voxels of 2"
         ),
-        Scene.open(two, read_points=read_points, budget_bytes=10),
+        Scene.open(two, budget_bytes=10),
     ):
         pass
 
@@ -209,7 +205,7 @@ def test_what_fails_half_way_leaves_no_file_open(
 ) -> None:
     through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
     file = write(TOP + '[[archives]]\npath = "floor"\n' + BALL + STOP + through)
-    with Scene.open(file, read_points=read_points):  # what it imports opens files
+    with Scene.open(file):  # what it imports opens files
         pass
     calls: list[int] = []
     place, _, method = fails.partition(".")
@@ -228,7 +224,7 @@ def test_what_fails_half_way_leaves_no_file_open(
     before, threads = os.listdir("/proc/self/fd"), set(threading.enumerate())
     with (
         pytest.raises(BadRequestError, match=r"hall.toml: \$.*no"),
-        Scene.open(file, read_points=read_points, policy="lru+prefetch"),
+        Scene.open(file, policy="lru+prefetch"),
     ):
         pass
     assert calls and len(os.listdir("/proc/self/fd")) == len(before)
@@ -254,7 +250,7 @@ def test_a_reload_finds_where_a_link_points_then(folder: Path, tmp_path: Path) -
     (tmp_path / "current").symlink_to("first")
     (tmp_path / "linked").symlink_to("one/deep")
     (tmp_path / "one/deep/hall.toml").write_text('format = 1\n[[archives]]\npath = "./../../current/"\n')
-    with Scene.open(tmp_path / "linked/hall.toml", read_points=read_points) as scene:
+    with Scene.open(tmp_path / "linked/hall.toml") as scene:
         assert scene.info().points == 121
         (tmp_path / "current").unlink()
         (tmp_path / "current").symlink_to("second")

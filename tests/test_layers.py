@@ -291,7 +291,7 @@ def test_every_room_says_what_it_may_import() -> None:
             "from ..zenoh_server.watchdog import RequestJob",
             "it may import kernels",
         ),
-        ("server/kernels/core/scene_arrays.py", "from ..rays.rays import STACK", "no other room"),
+        ("server/kernels/core/scene_arrays.py", "from ..rays.hits import STACK", "no other room"),
         ("server/scene.py", "from . import queries", "as a whole"),
         ("server/scene.py", "import h5py", "its door is schemas/process/new_hdf5_file.py"),
         ("builder/sources/formats/ply.py", "laspy = reader_library('laspy', path)", "its door is"),

@@ -42,12 +42,14 @@ compiler: Any = numba.core.compiler
 dispatcher: Any = numba.core.dispatcher
 _Dispatcher: Any = CPUDispatcher
 
-# LLVM's names of families of processors, the best first, and what a processor has to have. AVX-512 is
-# a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and 1.1 times as long as with code for itself
-# alone (`collide`, `distance`), with x86-64-v4 0.82 and 1.05.
+# LLVM's names of families of processors, the best first: what a processor has to have, and features
+# that differ from the name's. AVX-512 is a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and
+# 1.1 times as long as with code for itself alone (`collide`, `distance`). LLVM gives x86-64-v4 vectors
+# of 256 bits, because of early processors that slow down with wider ones; with 512 bits a Zen 5 takes
+# 0.86 and 0.92 times as long as with 256.
 _V3 = ("avx2", "bmi", "bmi2", "cx16", "f16c", "fma", "lzcnt", "movbe", "popcnt", "sahf", "xsave")
 _V4 = (*_V3, "avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl")
-_FAMILIES = {"x86-64-v4": _V4, "x86-64-v3": _V3}
+_FAMILIES = {("x86-64-v4", "-prefer-256-bit"): _V4, ("x86-64-v3", ""): _V3}
 
 _DEFAULTS: dict[str, Any] = compiler.Flags().values()
 
@@ -70,22 +72,24 @@ class _Codegen(JITCPUCodegen):  # type: ignore[misc]
     """
 
     def _get_host_cpu_name(self) -> str:
-        return _family() or super()._get_host_cpu_name()
+        family = _family()
+        return super()._get_host_cpu_name() if family is None else family[0]
 
     def _get_host_cpu_features(self) -> str:
-        return "" if _family() else super()._get_host_cpu_features()
+        family = _family()
+        return super()._get_host_cpu_features() if family is None else family[1]
 
 
 @functools.cache
-def _family() -> str:
-    """Return the name of the family; "" for the processor at hand, or for what the user chose."""
+def _family() -> tuple[str, str] | None:
+    """Return the family's name and features; None for the processor at hand, or for the user's choice."""
     if config.CPU_NAME is not None or config.CPU_FEATURES is not None:
-        return ""
+        return None
     machine = llvm.get_process_triple().partition("-")[0]
     if machine in ("aarch64", "arm64"):
-        return "generic"
+        return "generic", ""
     found = llvm.get_host_cpu_features() if machine == "x86_64" else {}
-    return next((name for name, needed in _FAMILIES.items() if all(map(found.get, needed))), "")
+    return next((family for family, needed in _FAMILIES.items() if all(map(found.get, needed))), None)
 
 
 @functools.cache

@@ -297,7 +297,7 @@ class Replay:
         self.planned = now
         self.tracks.expire(now, SILENCE)
         wanted = self.tracks.plan(now, self.usual)
-        self.kept = frozenset(self.tracks.kept(now, SILENCE).tolist())
+        self.kept = frozenset(self.tracks.kept().tolist())
         self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
         resident = self.resident
         self.queue.clear()

@@ -1,5 +1,8 @@
 """Query `raycast`: the first scan point's sphere that each ray hits."""
 
+import math
+import time
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -8,8 +11,8 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.rays.rays import ClosestHits, follow_rays
-from .nearest_hits import find_hits, make_origins, verdict_and_bounds
+from ..kernels.rays.hits import ClosestHits, HitBatch
+from .nearest_hits import find_hits, make_origins
 from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
 from .scene_data import SceneData, to_units
@@ -47,13 +50,13 @@ def raycast_steps(
 
     origins: (k, 3) float64, world [m].  directions: (k, 3), of any length except zero.
     reach: length of the rays [m], at most MAX_RAY_REACH.
-    kernels/rays/rays.py has the definition. A ray is `outside` if either of its ends, o or
+    kernels/rays/hits.py has the definition. A ray is `outside` if either of its ends, o or
     o + reach u in exact units, leaves the box of all scan points.
     The verdict is CONTACT if a sphere is hit, CLEAR if none is, and UNKNOWN if none was found but
     something in reach was not examined. If that could hide a nearer hit, `exact` is false and `lower`
     bounds its distance. Raise BadRequestError.
     """
-    spent = CostCounter(data)
+    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):
@@ -63,38 +66,26 @@ def raycast_steps(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-    best = yield from find_hits(data, follow_rays, units, unit, reach_units, data.radius_units, budget, spent)
-    verdict, lower, upper, exact = verdict_and_bounds(best.value, best.unseen, reach_units)
-    hit, cloud, normal = _where(data, world, units, unit, best)
-    ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])
+    hit, normal = (np.full((len(world), 3), math.nan) for _ in range(2))
+
+    def on_hits(which: NDArray[np.int64], best: ClosestHits) -> None:
+        """Write origin + distance u, and the normal along t u - d, from the sphere's centre to the hit.
+
+        It is opposite to the ray if these coincide.
+        """
+        t, u = best.value[:, None], unit[which]
+        hit[which] = world[which] + (t / UNITS_PER_METRE) * u
+        d = np.rint(best.lattice * data.arrays.units_per_step).astype(np.int64) - units[which]
+        away = t * u - d
+        length = np.sqrt((away * away).sum(axis=1))[:, None]
+        normal[which] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
+
     low, high = np.rint(data.tree.scene * data.arrays.units_per_step)
+    ends = units.astype(np.float64), units + float(reach_units) * unit
+    outside = np.any([(end < low) | (end > high) for end in ends], axis=(0, 2))
+    rays = HitBatch(units, unit, reach_units, data.radius_units)
+    hits = yield from find_hits(data, rays, budget, spent, on_hits)
     return RaycastAnswers(
-        verdict, upper, lower, upper.copy(), exact, hit, cloud, normal,
-        ((ends < low) | (ends > high)).any(axis=(0, 2)), *best.counts,
-        **spent.fields(),
+        hits.verdict, hits.distance, hits.lower, hits.distance.copy(), hits.exact, hit, hits.cloud, normal, outside,
+        *hits.counts, **spent.fields(),
     )  # fmt: skip
-
-
-def _where(
-    data: SceneData,
-    world: NDArray[np.float64],
-    units: NDArray[np.int64],
-    unit: NDArray[np.float64],
-    best: ClosestHits,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return hit, cloud_point and normal (k, 3); NaN for rays that hit nothing.
-
-    hit: origin + distance u, world [m].
-    normal: along t u - d in exact units, from the sphere's centre to the hit; opposite to the ray
-    if they coincide.
-    """
-    touched = np.isfinite(best.value)
-    hit, cloud, normal = (np.full((len(world), 3), np.nan) for _ in range(3))
-    t, u, lattice = best.value[touched][:, None], unit[touched], best.lattice[touched]
-    hit[touched] = world[touched] + (t / UNITS_PER_METRE) * u
-    cloud[touched] = lattice * data.arrays.step + data.arrays.origin
-    d = np.rint(lattice * data.arrays.units_per_step).astype(np.int64) - units[touched]
-    away = t * u - d
-    length = np.sqrt((away * away).sum(axis=1))[:, None]
-    normal[touched] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
-    return hit, cloud, normal

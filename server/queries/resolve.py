@@ -96,6 +96,8 @@ def resolve(
     lists = drop_entries(lists, ~absent)
     if not budget.stop:  # all that is resident has been searched
         lists = yield from settle(lists)
+    if not lists.starts[-1]:
+        return left
     return np.minimum(left, (yield from load_and_search(data, lists, search, budget, spent)))
 
 
@@ -142,10 +144,14 @@ def _next_rows(data: SceneData, ahead: NDArray[np.int64], needed: NDArray[np.int
     resident ones of those that some item still needs. Those that do not fit in the cache together
     are left for another round.
     """
-    where, ahead = data.arrays.where, _distinct(ahead)
+    where = data.arrays.where
     later: NDArray[np.bool_] = np.zeros(len(where), bool)
     later[needed] = True
     later &= where[:, 0] >= 0
+    rows = np.flatnonzero(later)
+    if later[ahead].all() and len(_that_fit(data, rows)) == len(rows):
+        return rows  # nothing is loaded: the order does not matter
+    ahead = _distinct(ahead)
     later[ahead] = False
     return _that_fit(data, np.concatenate([ahead, np.flatnonzero(later)]))
 

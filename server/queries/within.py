@@ -1,13 +1,15 @@
 """Query `within`: the scan point nearest to each query point."""
 
+import time
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.rays.points import search_points
-from .nearest_hits import find_hits, found_units, make_origins, verdict_and_bounds
+from ..kernels.rays.hits import HitBatch
+from .nearest_hits import find_hits, make_origins
 from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
 from .scene_data import SceneData, to_units
@@ -24,23 +26,19 @@ def within_steps(
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
-    kernels/rays/points.py has the definition. A point is `outside` if its reach, a cube of exact
+    kernels/rays/hits.py has the definition. A point is `outside` if its reach, a cube of exact
     units, leaves the box of all scan points. Verdicts and bounds are as for `raycast`.
     Raise BadRequestError.
     """
-    spent = CostCounter(data)
+    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
-    best = yield from find_hits(data, search_points, units, None, reach_units, 0, budget, spent)
-    verdict, lower, upper, exact = verdict_and_bounds(found_units(best), best.unseen, reach_units)
-    cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
-    touched = best.square >= 0
-    cloud[touched] = best.lattice[touched] * data.arrays.step + data.arrays.origin
     low, high = np.rint(data.tree.scene * data.arrays.units_per_step).astype(np.int64)
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
+    hits = yield from find_hits(data, HitBatch(units, np.empty((0, 3)), reach_units, 0), budget, spent)
     return WithinAnswers(
-        verdict, upper, lower, upper.copy(), exact, cloud, outside, *best.counts,
-        **spent.fields(),
+        hits.verdict, hits.distance, hits.lower, hits.distance.copy(), hits.exact, hits.cloud, outside,
+        *hits.counts, **spent.fields(),
     )  # fmt: skip

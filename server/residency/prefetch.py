@@ -182,7 +182,7 @@ class Prefetcher:
             tracks.expire(now, SILENCE)
             wanted = tracks.plan(now, usual)
             need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
-            residency.kept = self._within_share(tracks.kept(now, SILENCE).tolist(), need)
+            residency.kept = self._within_share(tracks.kept().tolist(), need)
         except Exception:  # for example out of memory: requested voxels are loaded all the same
             log.exception("the prefetch plan failed")
             return {}, now + MAX_REST

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from point_clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
 from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from sample_sizes import sample
-from solidcloud.server.kernels.rays.rays import first_meeting
+from solidcloud.server.kernels.rays.hits import first_meeting
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.scene_data import SceneData
 from solidcloud.server.queries.within import within
@@ -131,7 +131,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
 def test_the_formula_is_as_near_the_ideal_as_it_says(
     seed: int, size: float, radius: int, grazing: bool
 ) -> None:
-    """In fractions, for the direction given: which spheres are hit, and where. The bounds of kernels/rays/rays.py."""
+    """In fractions, for the direction given: which spheres are hit, and where. The bounds of kernels/rays/hits.py."""
     rng = np.random.default_rng(seed)
     d = np.rint(rng.normal(size=3) * size).astype(np.int64)
     direction = rng.normal(size=3)

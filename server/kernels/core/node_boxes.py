@@ -55,7 +55,7 @@ def box_square(words, row, dx, dy, dz):
 def enter_box(words, row, ray, radius, first, last):
     """Return where a ray enters the box of a row, inflated by `radius`, in [first, last]; inf if nowhere.
 
-    ray: as in `meet_node` of kernels/rays/rays.py. All distances in steps, float64.
+    ray: as in `meet_node` of kernels/rays/hits.py. All distances in steps, float64.
     """
     for k in range(3):
         slope, off = ray[3 + k], np.float64(words[row + k]) - ray[k]

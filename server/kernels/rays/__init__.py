@@ -1,5 +1,5 @@
 """Rays and points against the scene: raycast, nearest point, normals.
 
 May import server.kernels.core, schemas.
-Begin with rays.py; surface.py has the points around one point.
+Begin with hits.py; surface.py has the points around one point.
 """

@@ -14,7 +14,7 @@ from ..core.node_boxes import box_square, has_box
 from ..core.normal_codes import add_sums
 from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
-from .rays import STACK
+from .hits import STACK
 
 U = np.uint64  # see placed_avatar.py
 

@@ -23,7 +23,7 @@ from ..motion.sweep_resident import (
     pose_between,
     sweep_resident,
 )
-from ..rays.points import nearest_in_memory
+from ..rays.hits import nearest_in_memory
 from .walk_obstacles import first_body, touches_no_body
 from .walk_state import (
     ANSWER,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import archive_cases
 import numpy as np
@@ -14,14 +15,18 @@ import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.units import UNITS_PER_METRE
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.kernels.rays.hits import HitBatch, search_hits
+from solidcloud.server.queries import nearest_hits
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.request import EXACT, make_budget
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data
+from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_stop
 from solidcloud.server.queries.within import within
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -200,3 +205,44 @@ def test_what_is_refused_of_rays(noise: Path, origins, directions, reach, text) 
 def test_what_is_refused_of_points(noise: Path, points, reach) -> None:  # type: ignore[no-untyped-def]
     with opened(noise) as data, pytest.raises(BadRequestError):
         within(data, points, reach)
+
+
+@pytest.mark.parametrize("kind", ["raycast", "within"])
+def test_no_batch_begins_after_a_stop(beads: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """The flag is set while the first batch is searched: its answers stay, the others are unknown."""
+    monkeypatch.setattr(nearest_hits, "BATCH", 4)
+    stop, search, calls = StopFlag(), nearest_hits.search_hits, []
+
+    def search_and_stop(*arguments: Any) -> None:
+        search(*arguments)
+        calls.append(arguments)
+        stop.set("test")
+
+    monkeypatch.setattr(nearest_hits, "search_hits", search_and_stop)
+    places, budget = np.tile([1.5, 0.0, 0.0], (11, 1)), EXACT._replace(stop=stop)
+    with opened(beads) as data:
+        if kind == "raycast":
+            found = raycast(data, places, np.tile(X, (11, 1)), 1.0, budget)
+        else:
+            found = within(data, places, 1.0, budget)
+    assert len(calls) == 1
+    assert (found.verdict[:4] == CONTACT).all() and (found.verdict[4:] == UNKNOWN).all()
+    assert not found.exact[4:].any() and (found.lower[4:] == 0.0).all() and np.isinf(found.distance[4:]).all()
+    assert np.isnan(found.cloud_point[4:]).all() and not found.node_visits[4:].any()
+
+
+@pytest.mark.parametrize("kind", ["raycast", "within"])
+def test_a_kernel_searches_nothing_once_it_is_stopped(beads: Path, kind: str) -> None:
+    places, stop = np.tile([1.5, 0.0, 0.0], (11, 1)), StopFlag()
+    stop.set("test")
+    with opened(beads) as data, data.residency.hold(range(len(data.keys))):
+        units = np.rint((places - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
+        direction = np.tile(X, (11 if kind == "raycast" else 0, 1))
+        batch = HitBatch(units, direction, UNITS_PER_METRE, data.radius_units)
+        lists, best = nearest_hits._list(data, batch), nearest_hits.no_hits(11)
+        cursor = lists.starts[:-1].copy()
+        for flag in (stop, NO_STOP):
+            arrays = with_stop(data, flag).arrays
+            search_hits(batch, lists, np.arange(11), cursor, np.empty(0, np.uint8), arrays, best)
+            assert np.isfinite(best.value).all() == best.counts[1].all() == (flag is NO_STOP)
+            assert (cursor > lists.starts[:-1]).all() == (flag is NO_STOP)

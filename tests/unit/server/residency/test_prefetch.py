@@ -42,7 +42,7 @@ class Wishes:
         need = np.array([self.wanted[row] for row in rows])
         return PredictedVoxels(np.array(rows, np.int64), need)
 
-    def kept(self, now: float, after: float = 0.0) -> np.ndarray:
+    def kept(self) -> np.ndarray:
         """What users stand in."""
         return np.array(self.standing, np.int64)
 

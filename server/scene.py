@@ -210,8 +210,6 @@ class Scene(QueryMethods):
                     error.args = (f"archive {number}: {error}{new}",)
                 raise
         before, after = (sum(getattr(a, f"generation_{side}") for a in each) for side in ("before", "after"))
-        if self._simulation is not None:
-            self._simulation.reloaded(after)
         return ReloadAnswer(
             self.name, before, after, sum(a.points for a in each), time.perf_counter() - begin
         )

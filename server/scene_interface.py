@@ -37,7 +37,7 @@ from ..schemas.wire.residency_messages import ResidencyChanges
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer
-from .runtime.stop_flag import StopFlag
+from .runtime.stop_flag import NO_STOP, StopFlag
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -261,8 +261,7 @@ class ServedSimulation(Protocol):
         self,
         turns: Sequence[FrameCommand],
         now: float | None = None,
-        *,
-        stops: Sequence[StopFlag] | None = None,
+        stop: StopFlag = NO_STOP,
     ) -> list[FrameResult]: ...
     def end(self, user: User) -> None: ...
     def end_client(self, client: str) -> None: ...

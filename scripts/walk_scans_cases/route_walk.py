@@ -1,6 +1,7 @@
 """Walk of one route: motion commands towards the waypoints, in a session that is recorded to a log."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire.motion_messages import State
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.replay import check_same, recorded, replay
-from solidcloud.server.simulation.replay_log import Begin, read_log
+from solidcloud.server.simulation.replay_log import read_log
 
 from .persons import Person
 from .routes import Leg, Route, Scan
@@ -134,10 +135,7 @@ def record_walk(scene: Scene, scan: Scan, route: Route, person: Person, file: Pa
 
 def replay_walk(file: Path, log: Path) -> dict[str, Any]:
     """Replay a log in a newly opened scene, as `solidcloud replay` does; return what it found."""
-    records = read_log(log)
-    begin = next(records)
-    assert isinstance(begin, Begin)
-    with Scene.open(file, begin.scene) as scene:
-        assert check_same(begin, scene.simulation, file)
-        found = replay(scene.simulation, records)
-    return {**found._asdict(), "first": None if found.first is None else str(found.first)}
+    head, frames = read_log(log)
+    with Scene.open(file, head.scene) as scene:
+        assert check_same(head, scene.simulation, file)
+        return asdict(replay(scene.simulation, frames))

@@ -23,6 +23,7 @@ from ...schemas.archive.rigid_pose import check_rigid
 from ...schemas.errors import (
     BadRequestError,
     BusyError,
+    ErrorCode,
     ExpiredError,
     InternalError,
     SolidcloudError,
@@ -50,7 +51,7 @@ from ..queries.request import LateVoxels, QueryBudget
 from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .replay_log import BodyRecord, FrameLog, record_of, take_record
+from .replay_log import FrameLog, LoggedTurn, take_record
 from .world.frame import MAX_TOUCHED, Body, Pose, Vec
 from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
@@ -68,6 +69,9 @@ LONGEST_FRAME = 0.1
 LONGEST_PAUSE = 0.5
 # A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
+# Stop flag of the turns of a replay that were stopped when they were logged.
+_STOPPED = StopFlag()
+_STOPPED.set("stopped when it was logged")
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 
@@ -188,8 +192,8 @@ class Simulation:
         self,
         turns: Sequence[FrameCommand],
         now: float | None = None,
-        stops: Sequence[StopFlag] | None = None,
-        kept: Sequence[BodyRecord | None] | None = None,
+        stop: StopFlag = NO_STOP,
+        logged: Sequence[LoggedTurn] | None = None,
     ) -> list[FrameResult]:
         """Simulate one frame: the motion commands of `turns`, in order. Return their outcomes.
 
@@ -197,32 +201,36 @@ class Simulation:
         pose. The outcome of a refused command is its error; the others are simulated.
         now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
         first; None: no user is removed.
-        stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
-        ExpiredError.
-        kept: for a replay: for each turn, a recorded result that is taken without a simulation, or
-        None. All others wait for voxels.
+        stop: ends the frame early: users not yet simulated stay, with the outcome ExpiredError.
+        logged: of each turn, for a replay. A result with a recorded body is taken without a
+        simulation, and a turn that was stopped is stopped again. All others wait for voxels.
         """
         with self._frame:
             if now is not None:
                 self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
             self._frames += 1
-            outcomes, opened, records = [], [], []
+            outcomes = []
             for number, turn in enumerate(turns):
-                stop = NO_STOP if stops is None else stops[number]
-                # In a replay, a frame without a record lacked nothing: it gives what a wait would give.
-                budget = _frame_budget(turn.wish.late if kept is None else WAIT, stop)
-                given = None if kept is None else kept[number]
+                was = None if logged is None else logged[number]
+                late = turn.wish.late
+                if was is not None:
+                    # A frame without a record lacked nothing: it gives what a wait would give. When a
+                    # frame is stopped depended on a clock.
+                    late, stop = WAIT, _STOPPED if was.error == ErrorCode.EXPIRED else NO_STOP
+                budget = _frame_budget(late, stop)
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    state = self._simulate_turn(turn, now, budget, given)
+                    state = self._simulate_turn(turn, now, budget, was)
                 there = self._present.get(turn.user)
-                about = b"".join(used) if there is None else there.body.avatar.digest
-                outcomes.append(FrameResult(turn.user, state, about))
-                opened.append(() if there is None else there.body.generations)
-                lacked = budget.late is not None and budget.late.count > 0 and isinstance(state, State)
-                records.append(record_of(there.body, self._bodies) if lacked and there else None)
+                body = None if there is None else there.body
+                outcomes.append(
+                    FrameResult(turn.user, state, b"".join(used) if body is None else body.avatar.digest)
+                )
+                if self._recorder is not None:
+                    lacked = budget.late is not None and budget.late.count > 0
+                    self._recorder.turn(turn, state, body, self._bodies, lacked=lacked)
             if self._recorder is not None:
-                self._recorder.frame(self._frames, turns, outcomes, opened, records)
+                self._recorder.write(self._frames)
             return outcomes
 
     def _simulate_turn(
@@ -230,12 +238,12 @@ class Simulation:
         turn: FrameCommand,
         now: float | None,
         budget: QueryBudget,
-        given: BodyRecord | None,
+        logged: LoggedTurn | None,
     ) -> State | SolidcloudError:
         """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._simulate_command(turn.user, turn.wish, now, budget, given)
+            moved = self._simulate_command(turn.user, turn.wish, now, budget, logged)
         except SolidcloudError as error:
             return error
         except StoppedError:
@@ -259,7 +267,7 @@ class Simulation:
         command: Wish,
         now: float | None,
         budget: QueryBudget,
-        given: BodyRecord | None,
+        logged: LoggedTurn | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
         there = self._present.get(user)
@@ -271,12 +279,12 @@ class Simulation:
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
                 undo.callback(self._bodies.place_objects(command.objects, budget.stop))
-            if given is None:
+            if logged is None or logged.body is None:
                 run = partial(self._pipeline.run, budget=budget)
                 durations = frame_durations(command, present.time)
                 moved = run_frames(run, command, durations, present.body, self._up, self._bodies)
             else:
-                moved = take_record(given, present.body, self.world, self._bodies)
+                moved = take_record(logged, present.body, self.world, self._bodies)
             undo.pop_all()
         present.time = command.time
         present.heard = present.heard if now is None else now
@@ -304,7 +312,7 @@ class Simulation:
             if self._bodies is not None:
                 self._bodies.pop(user)
         if users and self._recorder is not None:
-            self._recorder.ended(users)
+            self._recorder.frame.ended += users
 
     def end(self, user: User) -> None:
         """Remove a user and its body. Its next command is again a first one."""
@@ -322,7 +330,7 @@ class Simulation:
             self._remove([user for user in self._present if user.client == client])
             self.scene.forget_client(client)
             if self._recorder is not None:
-                self._recorder.dropped(client)
+                self._recorder.frame.dropped.append(client)
 
     def warm(self) -> None:
         """Simulate some frames, so that no user waits for compilation. Nobody else may use this simulation.
@@ -348,12 +356,6 @@ class Simulation:
         if self._bodies is not None:
             self._bodies.pop(other)
         self.scene.forget_client(_WARM)
-
-    def reloaded(self, generation: int) -> None:
-        """Record that the archives were reloaded."""
-        if self._recorder is not None:
-            with self._frame:
-                self._recorder.reloaded(generation)
 
 
 def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:

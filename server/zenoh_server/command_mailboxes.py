@@ -317,7 +317,7 @@ class FrameLoop:
         if self._watchdog.asleep:
             self._watchdog.wake()
         try:
-            return self._simulation.step(turns, now, stops=[stop] * len(turns))
+            return self._simulation.step(turns, now, stop)
         finally:
             self._at_work = None
 

@@ -41,7 +41,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import AvatarShape, record_avatar
 from solidcloud.server.simulation.local_session import LocalSession
-from solidcloud.server.simulation.replay_log import Begin, FrameLog
+from solidcloud.server.simulation.replay_log import FrameLog, LogHead
 from solidcloud.server.simulation.simulation import Simulation
 from solidcloud.server.zenoh_server.serve_loop import serve
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -157,8 +157,6 @@ class FloorScene:
         if self.refuses is not None:
             raise self.refuses
         self.reloaded += 1
-        if self.simulation is not None:
-            self.simulation.reloaded(self.reloaded)
         return ReloadAnswer(self.name, self.reloaded - 1, self.reloaded, 4)
 
     def stats(self, keys=False):
@@ -323,5 +321,5 @@ if __name__ == "__main__":
         scene = floor_simulation(arguments.name).scene
     scene.never_warm = arguments.never_warm
     if arguments.log:
-        scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [], MOTION_VERSION)))
+        scene.simulation.record(FrameLog(arguments.log, LogHead(arguments.name, "", b"", [], MOTION_VERSION)))
     serve([scene], ServerConfig(listen=arguments.listen, stop_seconds=arguments.stop_seconds))

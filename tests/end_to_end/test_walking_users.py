@@ -1,6 +1,6 @@
 """Test users who walk in a scene with effects, over zenoh: obstacles, memory, and replay of the log."""
 
-import struct
+import json
 import sys
 import zlib
 from collections.abc import Iterator
@@ -21,8 +21,8 @@ from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import FrameCommand
-from solidcloud.server.simulation.replay import recorded, replay
-from solidcloud.server.simulation.replay_log import MAGIC, FrameRecord, read_log
+from solidcloud.server.simulation.replay import Replayed, recorded, replay
+from solidcloud.server.simulation.replay_log import read_log
 from solidcloud.server.simulation.simulation import make_simulation
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -193,8 +193,7 @@ def test_a_replay_gives_the_same_poses_bit_for_bit(
     for arguments in ([str(log)], [str(log), str(scene)]):
         assert run(["replay", *arguments]) == 0
         assert capsys.readouterr().out == "302 frames, 302 turns: none different\n"
-    frames = [record for record in read_log(log) if isinstance(record, FrameRecord)]
-    moved = {said.pose for frame in frames for said in frame.said}
+    moved = {str(turn.pose) for frame in read_log(log)[1] for turn in frame.turns}
     assert len(moved) > 200, "they did not just stand there"
 
 
@@ -230,34 +229,24 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
     with Scene.open(path) as scene:  # not warmed: warming leaves no trace
-        assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None, 0)
-
-
-def records_of(whole: bytes) -> Iterator[tuple[int, int]]:
-    """Return the offset of each record's body, and its length."""
-    at = len(MAGIC)
-    while at < len(whole):
-        (length,) = struct.unpack_from("<I", whole, at)
-        yield at + 12, length
-        at += 12 + length
+        assert replay(scene.simulation, read_log(log)[1]) == Replayed(60, 120)
 
 
 def test_a_log_with_one_bit_changed_is_not_believed(
     logged: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = bytearray(logged[1].read_bytes())
-    bodies = [
-        (at, length) for at, length in records_of(bytes(whole)) if b"\xa5frame" in whole[at : at + length]
-    ]
-    at, length = bodies[100]
-    pose = whole.rindex(b"\xc4\x80", at, at + length) + 2
-    whole[pose] ^= 1
-    (tmp_path / "changed.log").write_bytes(whole)
+    lines = logged[1].read_bytes().splitlines(keepends=True)
+    frame = json.loads(lines[102][9:])  # frame 101, after the magic and the head
+    row = frame["turns"][0]["pose"][0]
+    row[3] = float(np.nextafter(row[3], 2.0))
+    body = json.dumps(frame).encode()
+    lines[102] = lines[102][:9] + body + b"\n"
+    (tmp_path / "changed.log").write_bytes(b"".join(lines))
     assert run(["replay", str(tmp_path / "changed.log")]) == 3
-    assert f"at byte {at - 12}: its bytes have checksum" in capsys.readouterr().err
+    assert "changed.log: line 103: its checksum is" in capsys.readouterr().err
     # With a corrected checksum, the replay finds the change in the poses.
-    struct.pack_into("<I", whole, at - 4, zlib.crc32(bytes(whole[at : at + length])))
-    (tmp_path / "fitting.log").write_bytes(whole)
+    lines[102] = b"%08x %s\n" % (zlib.crc32(body), body)
+    (tmp_path / "fitting.log").write_bytes(b"".join(lines))
     assert run(["replay", str(tmp_path / "fitting.log")]) == 1
     out = capsys.readouterr().out
     assert out.startswith("302 frames, 302 turns: 1 different\nfirst: frame 101, avatar ")

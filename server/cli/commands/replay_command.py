@@ -1,5 +1,6 @@
 """`solidcloud replay`: simulate the frames of a log again and compare them bit for bit."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -27,20 +28,16 @@ def replay(
     from ...scene import Scene
     from ...simulation.replay import check_same
     from ...simulation.replay import replay as replay_log
-    from ...simulation.replay_log import Begin, read_log
+    from ...simulation.replay_log import read_log
 
-    records = read_log(log)
-    begin = next(records)
-    assert isinstance(begin, Begin), "read_log checks this"
-    path = Path(begin.path) if what is None else what
-    with Scene.open(path, begin.scene, budget_bytes=parse_bytes(cache, "--cache")) as scene:
-        simulation = scene.simulation
-        if not check_same(begin, simulation, path):
+    head, frames = read_log(log)
+    path = Path(head.path) if what is None else what
+    with Scene.open(path, head.scene, budget_bytes=parse_bytes(cache, "--cache")) as scene:
+        if not check_same(head, scene.simulation, path):
             print_warning(f"{path} is not the scene file that was logged")
-        found = replay_log(simulation, records)
+        found = replay_log(scene.simulation, frames)
     if as_json:
-        first = None if found.first is None else str(found.first)
-        print_json({**found._asdict(), "first": first})
+        print_json(asdict(found))
         return int(found.different > 0)
     print(f"{found.frames} frames, {found.turns} turns: {found.different or 'none'} different")
     if found.taken:

@@ -15,7 +15,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import State
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.replay import recorded, replay
-from solidcloud.server.simulation.replay_log import FrameRecord, read_log
+from solidcloud.server.simulation.replay_log import read_log
 
 pytestmark = pytest.mark.interpreted
 
@@ -186,9 +186,9 @@ def test_a_replay_takes_what_was_not_in_memory_from_the_log(room: Path, tmp_path
             states = wishes(session, [effect_rooms.at(0, 0, -0.4)] * 3)
             until(lambda: wishes(session, corners(1, len(states), -0.4))[0], lambda state: not state.unknown)
             wishes(session, corners(6 if effect_rooms.INTERPRETED else 30, 2, -0.4))
-    frames = [record for record in read_log(log) if isinstance(record, FrameRecord)]
-    taken = [frame.said[0].kept is not None for frame in frames]
+    frames = list(read_log(log)[1])
+    taken = [frame.turns[0].body is not None for frame in frames]
     assert taken[0] and not all(taken)
     with Scene.open(path, "room") as scene:
-        found = replay(scene.simulation, read_log(log))
+        found = replay(scene.simulation, frames)
     assert (found.turns, found.different, found.taken) == (len(frames), 0, sum(taken))

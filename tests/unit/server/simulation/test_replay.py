@@ -1,6 +1,6 @@
 """Replays: the same wishes give the same poses; what differs is named by its frame and user."""
 
-import struct
+import json
 import zlib
 
 import msgspec
@@ -12,21 +12,13 @@ from solidcloud.schemas.scene.effect_table import MOTION_VERSION
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Moved, Wish
 from solidcloud.server.scene_interface import FrameCommand
-from solidcloud.server.simulation.replay import replay
-from solidcloud.server.simulation.replay_log import (
-    AvatarPoints,
-    Begin,
-    Entered,
-    FrameLog,
-    FrameRecord,
-    Record,
-    read_log,
-)
+from solidcloud.server.simulation.replay import Replayed, check_same, replay
+from solidcloud.server.simulation.replay_log import FrameLog, LoggedFrame, LogHead, read_log
 
 pytestmark = pytest.mark.interpreted
 
 AL, BO, CY = User("a", "al"), User("b", "bo"), User("a", "cy")
-BEGIN = Begin("floor", "", b"", [], MOTION_VERSION)
+HEAD = LogHead("floor", "", b"", [], MOTION_VERSION)
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 
 
@@ -58,7 +50,7 @@ def log(tmp_path):
     for user in (AL, BO, CY):
         simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     users = [AL, BO, CY, User("d", "unknown")]
-    with FrameLog(path, BEGIN) as frames:
+    with FrameLog(path, HEAD) as frames:
         simulation.record(frames)
         for number in range(60):
             turns = []
@@ -78,100 +70,83 @@ def log(tmp_path):
     return path
 
 
+def frames_of(path):
+    return list(read_log(path)[1])
+
+
 def test_the_same_wishes_give_the_same_poses(log):
-    records = list(read_log(log))
-    assert sum(isinstance(record, AvatarPoints) for record in records) == 2
-    found = replay(simulated(), records)
-    turns = sum(len(record.turns) for record in records if isinstance(record, FrameRecord))
-    assert found == (60, turns, 0, None, None, 0)
-    codes = {said.error for record in records if isinstance(record, FrameRecord) for said in record.said}
+    frames = frames_of(log)
+    assert sum(len(frame.avatars) for frame in frames) == 2
+    found = replay(simulated(), frames)
+    assert found == Replayed(60, sum(len(frame.turns) for frame in frames))
+    codes = {turn.error for frame in frames for turn in frame.turns}
     assert codes == {"", "bad_transform", "unknown_avatar", "busy"}
 
 
-def changed(records, number, edit):
-    """Records with one turn's outcome in one frame edited."""
-    for record in records:
-        if isinstance(record, FrameRecord) and record.number == number:
-            said = [edit(record.said[0]), *record.said[1:]]
-            yield msgspec.structs.replace(record, said=said)
-        else:
-            yield record
-
-
 def test_one_bit_of_one_pose_is_found_and_named(log):
-    records = list(read_log(log))
-    frames = [record for record in records if isinstance(record, FrameRecord) and record.said[0].pose]
-    frame = frames[len(frames) // 2]
-    user = User(*frame.turns[0][0])
-
-    def flip(said):
-        return msgspec.structs.replace(said, pose=bytes([said.pose[0] ^ 1]) + said.pose[1:])
-
-    found = replay(simulated(), changed(records, frame.number, flip))
+    frames = frames_of(log)
+    moved = [frame for frame in frames if frame.turns[0].pose]
+    frame = moved[len(moved) // 2]
+    turn = frame.turns[0]
+    pose = [list(row) for row in turn.pose]
+    pose[0][0] = float(np.nextafter(1.0, 2.0))
+    frame.turns[0] = msgspec.structs.replace(turn, pose=pose)
+    found = replay(simulated(), frames)
     assert (found.frames, found.different) == (60, 1)
-    assert found.first.frame == frame.number and found.first.user == user
-    logged, replayed = float(np.nextafter(1.0, 2.0)), 1.0
-    assert str(found.first) == (
-        f"frame {frame.number}, avatar {user.avatar} of client {user.client}: "
-        f"pose[0, 0] logged {logged!r}, replayed {replayed!r}"
+    assert found.first == (
+        f"frame {frame.number}, avatar {turn.user.avatar} of client {turn.user.client}: "
+        f"pose[0, 0] logged {pose[0][0]!r}, replayed 1.0"
     )
+
+
+def test_the_sign_of_a_zero_is_found(log):
+    frames = frames_of(log)
+    turn = frames[8].turns[0]
+    assert turn.pose[0][1] == 0.0
+    pose = [list(row) for row in turn.pose]
+    pose[0][1] = -0.0
+    frames[8].turns[0] = msgspec.structs.replace(turn, pose=pose)
+    assert "pose[0, 1] logged -0.0, replayed 0.0" in replay(simulated(), frames).first
 
 
 def test_a_wish_that_was_another_changes_what_comes_after(log, tmp_path):
     """An edit whose checksum was made to fit is found all the same, where it first tells."""
-    whole = bytearray(log.read_bytes())
-    at = whole.index(b"\xa5frame")
-    for _ in range(8):  # to frame 9, whose first command is not refused
-        at = whole.index(b"\xa5frame", at + 1)
-    pose = whole.index(b"\xa4pose\xc4\x80", at) + 7
-    whole[pose + 3 * 8] ^= 1  # the last bit of x
-    start = len(b"solidcloud frames 1\n")
-    while True:
-        (length,) = struct.unpack_from("<I", whole, start)
-        if start + 12 + length > pose:
-            break
-        start += 12 + length
-    struct.pack_into("<I", whole, start + 8, zlib.crc32(bytes(whole[start + 12 : start + 12 + length])))
-    (tmp_path / "edited").write_bytes(whole)
-    found = replay(simulated(), read_log(tmp_path / "edited"))
-    assert found.frames == 60 and found.different >= 1 and found.first.frame == 9
+    lines = log.read_bytes().splitlines()
+    frame = json.loads(lines[10][9:])  # frame 9, whose first command is not refused
+    frame["turns"][0]["wish"]["pose"][0][0][3] += 1e-9
+    body = json.dumps(frame).encode()
+    lines[10] = b"%08x %s" % (zlib.crc32(body), body)
+    (tmp_path / "edited").write_bytes(b"\n".join([*lines, b""]))
+    found = replay(simulated(), frames_of(tmp_path / "edited"))
+    assert found.frames == 60 and found.different >= 1 and found.first.startswith("frame 9, ")
 
 
 def test_a_refusal_that_is_none_now_is_a_difference(log):
     simulation = simulated()
     simulation.scene.add_avatar("unknown", POINTS, 0.125, client="d")
-    found = replay(simulation, read_log(log))
-    assert found.different > 0 and found.first.user == User("d", "unknown")
-    assert "logged error unknown_avatar, replayed a pose at" in str(found.first)
+    found = replay(simulation, frames_of(log))
+    assert found.different > 0
+    assert "avatar unknown of client d: logged error unknown_avatar, replayed a pose at" in found.first
 
 
 def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
     simulation, path = simulated(), tmp_path / "log"
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
-    with FrameLog(path, BEGIN) as frames:
+    with FrameLog(path, HEAD) as frames:
         simulation.record(frames)
         for number in range(4):
             simulation._pipeline.reloads = int(number == 3)
             wish = Wish(seq=number, time=float(number), pose=np.eye(4)[None])
             simulation.step([FrameCommand(AL, wish)])
-            if number == 1:
-                simulation.scene.reload()
-    assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4, 0)
+    assert replay(simulated(), frames_of(path)) == Replayed(3, 3, reloaded=4)
 
 
 def test_an_avatar_that_is_not_in_the_log_is_an_error():
-    records: list[Record] = [BEGIN, Entered(AL, b"?")]
     with pytest.raises(BadRequestError, match="avatar 'al': its points are not in the log"):
-        replay(simulated(), records)
+        replay(simulated(), [LoggedFrame(entered=[(AL, "?")])])
 
 
-def test_a_log_of_other_rules_of_motion_is_not_replayed(log):
-    """A log of the first version has no field `motion`; its poses would not come out again."""
-    old = b"\x85\xa4type\xa5begin\xa5scene\xa5floor\xa4path\xa0\xa4file\xc4\x00\xa8archives\x90"
-    begin = msgspec.msgpack.decode(old, type=Begin)
-    assert begin.motion == 1
-    records = [begin, *list(read_log(log))[1:]]
-    with pytest.raises(
-        BadRequestError, match=f"under version 1 of the rules of motion: expected {MOTION_VERSION}"
-    ):
-        replay(simulated(), records)
+def test_a_log_of_other_rules_of_motion_is_not_replayed(tmp_path):
+    head = msgspec.structs.replace(HEAD, motion=MOTION_VERSION - 1)
+    with pytest.raises(BadRequestError, match=f"rules of motion: expected {MOTION_VERSION}"):
+        check_same(head, simulated(), tmp_path)

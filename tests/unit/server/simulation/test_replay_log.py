@@ -6,27 +6,18 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError
+from solidcloud.schemas.wire.encoding import JSON, decode_request
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Wish
+from solidcloud.schemas.wire.requests import AddAvatarRequest
 from solidcloud.server.scene_interface import FrameCommand
-from solidcloud.server.simulation.replay_log import (
-    MAGIC,
-    AvatarPoints,
-    Begin,
-    Dropped,
-    Ended,
-    Entered,
-    FrameLog,
-    FrameRecord,
-    Reloaded,
-    read_log,
-)
+from solidcloud.server.simulation.replay_log import MAGIC, FrameLog, LogHead, read_log
 
 pytestmark = pytest.mark.interpreted
 
 AL, BO, NOBODY = User("a", "al"), User("b", "bo"), User("c", "nobody")
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
-BEGIN = Begin("floor", "/scans/floor", b"format = 1", [("ab" * 16, 3)])
+HEAD = LogHead("floor", "/scans/floor", b"format = 1", [("ab" * 16, 3)], 5)
 
 
 def wish(seq, z):
@@ -36,107 +27,107 @@ def wish(seq, z):
 
 
 def write(path):
-    """A log of two frames of two users with the same body, one who leaves, a reload; the simulation."""
+    """A log of three frames of users with the same body, one who leaves, and a client that is dropped."""
     simulation = floor_simulation()
     for user in (AL, BO):
         simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
-    with FrameLog(path, BEGIN) as log:
+    with FrameLog(path, HEAD) as log:
         simulation.record(log)
         simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.25))])
         simulation.end(BO)
         simulation.step([FrameCommand(AL, wish(2, -9.0)), FrameCommand(NOBODY, wish(1, 0.0))])
-        simulation.scene.reload()
         simulation.drop_client("a")
+        simulation.step([FrameCommand(BO, wish(3, 0.5))])
         simulation.record(None)
-    return simulation
+
+
+def records_of(path):
+    head, frames = read_log(path)
+    return [head, *frames]
 
 
 def test_all_that_decides_is_in_it_in_order_and_points_once(tmp_path):
     write(tmp_path / "log")
-    records = list(read_log(tmp_path / "log"))
-    kinds = [type(record) for record in records]
-    assert kinds == [
-        Begin,
-        AvatarPoints,
-        Entered,
-        Entered,
-        FrameRecord,
-        Ended,
-        FrameRecord,
-        Reloaded,
-        Ended,
-        Dropped,
+    head, first, second, third = records_of(tmp_path / "log")
+    assert head == HEAD and [frame.number for frame in (first, second, third)] == [1, 2, 3]
+    ((digest, encoded),) = first.avatars.items()
+    added = decode_request(AddAvatarRequest, encoded)
+    assert added.points.tobytes() == POINTS.tobytes() and added.radius == 0.125
+    assert first.entered == [(AL, digest), (BO, digest)] and [turn.user for turn in first.turns] == [AL, BO]
+    assert [turn.pose[2][3] for turn in first.turns] == [0.5, 0.25]
+    assert decode_request(Wish, bytes(first.turns[1].wish), JSON).pose[0, 2, 3] == 0.25
+    assert second.ended == [BO] and not second.entered and not second.avatars
+    assert [(turn.error, turn.pose is None) for turn in second.turns] == [
+        ("", False),
+        ("unknown_avatar", True),
     ]
-    begin, points, first, second, frame, left, later, reloaded, _, dropped = records
-    assert begin == BEGIN and points.points == POINTS.tobytes() and points.radius == 0.125
-    assert (first.user, second.user) == (AL, BO) and first.digest == second.digest == points.digest
-    assert frame.number == 1 and [user for user, _ in frame.turns] == [AL, BO]
-    assert [np.frombuffer(said.pose)[11] for said in frame.said] == [0.5, 0.25]
-    assert left.users == [BO] and reloaded.generation == 1 and dropped.client == "a"
-    assert [(said.error, len(said.pose)) for said in later.said] == [("", 128), ("unknown_avatar", 0)]
+    assert third.ended == [AL] and third.dropped == ["a"] and third.entered == [(BO, digest)]
 
 
 def test_another_radius_is_another_avatar(tmp_path):
     simulation = floor_simulation()
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     simulation.scene.add_avatar("bo", POINTS, 0.25, client="b")
-    with FrameLog(tmp_path / "log", BEGIN) as log:
+    with FrameLog(tmp_path / "log", HEAD) as log:
         simulation.record(log)
         simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))])
-    points = [record for record in read_log(tmp_path / "log") if isinstance(record, AvatarPoints)]
-    assert [record.radius for record in points] == [0.125, 0.25] and points[0].digest != points[1].digest
+    avatars = records_of(tmp_path / "log")[1].avatars.values()
+    assert [decode_request(AddAvatarRequest, each).radius for each in avatars] == [0.125, 0.25]
 
 
-def test_what_is_cut_off_anywhere_leaves_the_records_before(tmp_path):
+def test_what_is_cut_off_anywhere_leaves_the_records_before(tmp_path, caplog):
     write(tmp_path / "log")
     whole = (tmp_path / "log").read_bytes()
-    records = list(read_log(tmp_path / "log"))
+    records = records_of(tmp_path / "log")
+    assert not caplog.text
     found = []
     for length in range(len(MAGIC), len(whole), 3):
         (tmp_path / "cut").write_bytes(whole[:length])
         try:
-            found.append(len(list(read_log(tmp_path / "cut"))))
+            read = records_of(tmp_path / "cut")
         except FormatError as error:
             assert "cut off: expected a complete first record" in str(error)
-            found.append(0)
-        assert list(read_log(tmp_path / "cut")) == records[: found[-1]] if found[-1] else True
+            read = []
+        assert read == records[: len(read)]
+        found.append(len(read))
     assert found == sorted(found) and set(found) == set(range(len(records)))
+    assert "cut: line 5 is cut off: only the frames before it are read" in caplog.text
 
 
-def test_a_changed_bit_is_named_with_its_record_and_place(tmp_path):
+def test_a_changed_bit_is_named_with_its_line(tmp_path):
     write(tmp_path / "log")
     whole = (tmp_path / "log").read_bytes()
     rng = np.random.default_rng(5)
-    for at in rng.choice(np.arange(len(MAGIC), len(whole)), 100).tolist():
+    for at in rng.choice(np.arange(len(MAGIC), len(whole) - 1), 100).tolist():
         changed = bytearray(whole)
         changed[at] ^= 1 << int(rng.integers(8))
         (tmp_path / "changed").write_bytes(changed)
-        with pytest.raises(CorruptError, match=r"changed: record \d+ at byte \d+: .* unaltered file"):
-            list(read_log(tmp_path / "changed"))
+        with pytest.raises(CorruptError, match=r"changed: line \d: its checksum is .* unaltered file"):
+            records_of(tmp_path / "changed")
 
 
 def test_what_is_no_log_is_refused(tmp_path):
     (tmp_path / "other").write_bytes(b"t,x,y,z\n")
     with pytest.raises(FormatError, match="expected a log"):
-        list(read_log(tmp_path / "other"))
+        read_log(tmp_path / "other")
     with pytest.raises(FormatError, match="No such file"):
-        list(read_log(tmp_path / "none"))
+        read_log(tmp_path / "none")
 
 
 def test_a_log_is_not_written_over(tmp_path):
     write(tmp_path / "log")
     before = (tmp_path / "log").read_bytes()
     with pytest.raises(BadRequestError, match="exists"):
-        FrameLog(tmp_path / "log", BEGIN)
+        FrameLog(tmp_path / "log", HEAD)
     assert (tmp_path / "log").read_bytes() == before
     with pytest.raises(BadRequestError, match="cannot be written"):
-        FrameLog(tmp_path / "no" / "log", BEGIN)
+        FrameLog(tmp_path / "no" / "log", HEAD)
 
 
 def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
     simulation = floor_simulation()
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
-    log = FrameLog(tmp_path / "log", BEGIN)
+    log = FrameLog(tmp_path / "log", HEAD)
     simulation.record(log)
     simulation.step([FrameCommand(AL, wish(1, 0.5))])
 
@@ -153,4 +144,4 @@ def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
         ((_, state, _),) = simulation.step([FrameCommand(AL, wish(seq, 0.5))])
         assert state.seq == seq
     assert caplog.text.count("No space left on device") == 1
-    assert len(list(read_log(tmp_path / "log"))) == 4
+    assert len(records_of(tmp_path / "log")) == 2

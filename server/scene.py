@@ -26,7 +26,15 @@ from ..schemas.wire.stats import StatsAnswer
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..schemas.wire.warming_parts import MOTION, PARTS
 from .archives.archive_generation import ArchiveGeneration
-from .archives.ask_archives import PathParts, PlacedItems, PlaceItems, ask_along, ask_each, make_legs
+from .archives.ask_archives import (
+    PathParts,
+    PlacedItems,
+    PlaceItems,
+    ask_along,
+    ask_each,
+    hold_archives,
+    release,
+)
 from .archives.merge_answers import limit_pairs
 from .archives.placed_archive import PlacedArchive
 from .archives.residency_watch import ResidencyWatch
@@ -468,29 +476,24 @@ class Scene(QueryMethods):
         Each part answers the items [first, first + n) of `total`. All poses are checked before the
         first part. Raise UnknownAvatarError and the errors of `op`.
         """
-        taken: list[ArchiveGeneration] = []
+        held = hold_archives(self.archives, radius_model, stop)
         try:
-            for archive in self.archives:
-                taken.append(archive.take())
-            avatar, array = self.avatar(name, client), make_poses(poses)
-            legs = make_legs(self.archives, taken, radius_model, array)
-            ask, total = ask_along(legs, avatar, op, parameters, stop)
+            ask, total = ask_along(held, self.avatar(name, client), make_poses(poses), op, parameters, stop)
 
-            def ask_held(start: int, end: int) -> Cost:
-                # Hold the generations: the consumer may close the path, which releases `taken`.
+            def ask_part(start: int, end: int) -> Cost:
+                # Hold the generations: the consumer may close the path, which releases `held`.
                 with ExitStack() as stack:
-                    for opened in taken:
-                        stack.enter_context(opened.taken())
+                    for each in held:
+                        stack.enter_context(each.opened.taken())
                     part = ask(start, end)
                 self._metrics.answered(client, name, part)
                 return part
 
             most = largest_part(op, parameters)
             ahead = (self._path_threads.of(client), 2 * threads) if threads > 1 else (None, 1)
-            return PathParts(path_parts(ask_held, total, most, *ahead), taken)
+            return PathParts(path_parts(ask_part, total, most, *ahead), held)
         except BaseException:
-            for opened in taken:
-                opened.release()
+            release(held)
             raise
 
     @property

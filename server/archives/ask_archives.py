@@ -24,7 +24,6 @@ from ..runtime.stop_flag import NO_STOP, StopFlag
 from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
 from .placed_archive import PlacedArchive
-from .rigid_transform import Pose
 
 _A = TypeVar("_A", bound=Cost)
 # Items of a request in the frame of one archive, column by column, and whether the voxels near them
@@ -35,18 +34,53 @@ PlaceItems = Callable[[PlacedArchive, ArchiveGeneration], PlacedItems]
 DEFAULT_LIMIT = 100
 
 
-class PathLeg(NamedTuple):
-    """All poses of a path in the frame of one archive.
+class HeldArchive(NamedTuple):
+    """An archive of a scene, and the generation of it that a reader holds.
 
-    data: of the archive.  pose: (4, 4), archive to world; None: the identity.
-    first_source: number of the archive's first source among those of the scene.
-    poses: (k, 4, 4), avatar to archive.
+    data: of the generation, with a radius model and a stop flag.
     """
 
+    placed: PlacedArchive
+    opened: ArchiveGeneration
     data: SceneData
-    pose: Pose | None
-    first_source: int
-    poses: NDArray[np.float64]
+
+
+def hold_archives(
+    archives: Sequence[PlacedArchive], radius_model: str | None, stop: StopFlag
+) -> list[HeldArchive]:
+    """Return the current generation of each archive; the caller must `release` each.
+
+    radius_model: see schemas/archive/radius_model.py; None: that of each archive. Raise BadRequestError.
+    """
+    held: list[HeldArchive] = []
+    try:
+        for placed in archives:
+            opened = placed.take()
+            held.append(HeldArchive(placed, opened, opened.data))
+            data = with_stop(opened.radius_model(radius_model), stop)
+            held[-1] = HeldArchive(placed, opened, data)
+    except BaseException:
+        release(held)
+        raise
+    return held
+
+
+def release(held: Sequence[HeldArchive]) -> None:
+    """Release what `hold_archives` returned."""
+    for each in held:
+        each.opened.release()
+
+
+def ask_held(held: Sequence[HeldArchive], ask: Callable[[HeldArchive], _A]) -> list[_A]:
+    """Return the answers of each archive, in the world, for `merge_answers`.
+
+    ask: queries an archive about the items of a request, placed in its frame.
+    """
+    answers, first = [], 0
+    for each in held:
+        answers.append(answers_in_world(ask(each), each.placed.pose, first))
+        first += each.opened.sources
+    return answers
 
 
 def ask_each(
@@ -69,74 +103,57 @@ def ask_each(
     Raise BadRequestError, and the errors of the query.
     """
     budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
-    answers: list[_A] = []
-    first = 0
-    for archive in archives:
-        with archive.take() as opened:
-            data = with_stop(opened.radius_model(radius_model), budget.request)
-            items, scan = place(archive, opened)
-            own = budget._replace(scan=scan)
-            found = ask_until_stopped(question, k, own, partial(engine, data, own, items))
-            answers.append(answers_in_world(found, archive.pose, first))
-            first += opened.sources
-    return merge_answers(answers)
 
+    def ask(each: HeldArchive) -> _A:
+        items, scan = place(each.placed, each.opened)
+        own = budget._replace(scan=scan)
+        return ask_until_stopped(question, k, own, partial(engine, each.data, own, items))
 
-def make_legs(
-    archives: Sequence[PlacedArchive],
-    taken: Sequence[ArchiveGeneration],
-    radius_model: str | None,
-    poses: NDArray[np.float64],
-) -> list[PathLeg]:
-    """Return the leg of a path (poses (k, 4, 4), world) for each archive.
-
-    taken: the current generation of each archive, in the order of `archives`.
-    """
-    firsts = [0, *np.cumsum([opened.sources for opened in taken]).tolist()]
-    return [
-        PathLeg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
-        for opened, archive, first in zip(taken, archives, firsts, strict=False)
-    ]
+    held = hold_archives(archives, radius_model, budget.request)
+    try:
+        return merge_answers(ask_held(held, ask))
+    finally:
+        release(held)
 
 
 def ask_along(
-    legs: Sequence[PathLeg],
+    held: Sequence[HeldArchive],
     avatar: AvatarModel,
+    poses: NDArray[np.float64],
     op: str,
     parameters: dict[str, Any],
     stop: StopFlag = NO_STOP,
 ) -> tuple[Callable[[int, int], Cost], int]:
     """Return a function that answers items [start, end) of a path, and the total number of items.
 
-    op, parameters: the query, and its arguments beside avatar and poses.
+    poses: (k, 4, 4), world.  op, parameters: the query, and its arguments beside avatar and poses.
     stop: its `part_seconds` limits a part's time, all archives together.
     Raise the errors of `path_question`.
     """
     # All poses are checked here, so that an error names a pose by its position on the path.
-    asks = [path_question(leg.data, avatar, leg.poses, op, parameters, stop) for leg in legs]
+    asks, total = {}, 0
+    for each in held:
+        own = each.placed.poses_in(poses)
+        asks[each.placed], total = path_question(each.data, avatar, own, op, parameters, stop)
     limit = parameters.get("limit")
 
     def ask(start: int, end: int) -> Cost:
         begun = time.perf_counter()
-        answers = [
-            answers_in_world(ask_leg(start, end, begun), leg.pose, leg.first_source)
-            for leg, (ask_leg, _) in zip(legs, asks, strict=True)
-        ]
-        together = merge_answers(answers)
+        together = merge_answers(ask_held(held, lambda each: asks[each.placed](start, end, begun)))
         if isinstance(together, ContactsAnswers):
             return limit_pairs(together, DEFAULT_LIMIT if limit is None else limit)
         return together
 
-    return ask, asks[0][1]
+    return ask, total
 
 
 class PathParts(Iterator[Part]):
     """Parts of a path. Holds the archive generations that it reads until its end or `close`."""
 
-    def __init__(self, parts: Generator[Part, None, None], taken: Sequence[ArchiveGeneration]) -> None:
-        """Yield `parts`. taken: the generations that they read, released at the end."""
+    def __init__(self, parts: Generator[Part, None, None], held: Sequence[HeldArchive]) -> None:
+        """Yield `parts`. held: the generations that they read, released at the end."""
         self._parts = parts
-        self._taken = list(taken)
+        self._held = list(held)
 
     def __next__(self) -> Part:
         try:
@@ -147,11 +164,10 @@ class PathParts(Iterator[Part]):
 
     def close(self) -> None:
         """End the path and release its generations. Closing twice is allowed."""
-        taken, self._taken = self._taken, []
-        if taken:
+        held, self._held = self._held, []
+        if held:
             self._parts.close()
-            for opened in taken:
-                opened.release()
+            release(held)
 
     def __del__(self) -> None:
         self.close()

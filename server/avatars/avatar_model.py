@@ -1,7 +1,7 @@
 """Avatar: the user's body as spheres, with their hierarchy (avatar_tree.py)."""
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +10,7 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo
+from ..kernels.core.array_references import refer_to_avatar
 from ..kernels.core.placed_avatar import MAX_FRONT, Avatar
 from ..kernels.core.scene_arrays import LANES
 from .avatar_tree import bound_nodes, mean_spacing, pack_points
@@ -26,6 +27,8 @@ class AvatarModel(NamedTuple):
     arrays: arrays that the kernels read.
     rows: (b, LANES) int32, the row of `points` in each lane of a block.
     bounding_radius: of a sphere that encloses all spheres of the avatar [m].
+    box: (2, 3) around its points [m]; zeros if it has none.
+    reference: `AvatarReference` to these arrays, for kernels that are called once a pose.
     inner_points: number of the points inside, the last ones.
     digest: `avatar_digest` of an avatar that a client added; empty for an avatar of the scene file.
     """
@@ -35,6 +38,8 @@ class AvatarModel(NamedTuple):
     arrays: Avatar
     rows: NDArray[np.int32]
     bounding_radius: float
+    box: NDArray[np.float64]
+    reference: Any
     inner_points: int = 0
     digest: bytes = b""
 
@@ -64,7 +69,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
     if not len(array):
         nodes, blocks = np.empty(0, np.int32), np.empty((0, 3, LANES))
         empty = Avatar(np.empty((0, 3)), np.empty(0), nodes, nodes, blocks, np.empty((4, 0)), 0, 0)
-        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0)
+        return _model(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0, 0)
     tree = pack_points(array)
     if radius is None:
         radius = mean_spacing(tree) / 2
@@ -100,4 +105,19 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
         inner_points,
     )
     bounding_radius = float(node_radius[0]) + float(radius)
-    return AvatarModel(array, float(radius), arrays, rows, bounding_radius, inner_points)
+    return _model(array, float(radius), arrays, rows, bounding_radius, inner_points)
+
+
+def _model(
+    points: NDArray[np.float64],
+    radius: float,
+    arrays: Avatar,
+    rows: NDArray[np.int32],
+    bounding_radius: float,
+    inner_points: int,
+) -> AvatarModel:
+    """Return the model with these fields."""
+    points = np.ascontiguousarray(points)
+    box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.zeros((2, 3))
+    reference = refer_to_avatar(arrays, rows, len(points) - inner_points, points, radius, box)
+    return AvatarModel(points, radius, arrays, rows, bounding_radius, box, reference, inner_points)

@@ -1,7 +1,6 @@
 """Query `raycast`: the first scan point's sphere that each ray hits."""
 
 import math
-import time
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,7 +55,7 @@ def raycast_steps(
     something in reach was not examined. If that could hide a nearer hit, `exact` is false and `lower`
     bounds its distance. Raise BadRequestError.
     """
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    spent = CostCounter(data)
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):
@@ -66,7 +65,8 @@ def raycast_steps(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-    hit, normal = (np.full((len(world), 3), math.nan) for _ in range(2))
+    hit: NDArray[np.float64] = np.full((len(world), 3), math.nan)
+    normal: NDArray[np.float64] = np.full((len(world), 3), math.nan)
 
     def on_hits(which: NDArray[np.int64], best: ClosestHits) -> None:
         """Write origin + distance u, and the normal along t u - d, from the sphere's centre to the hit.

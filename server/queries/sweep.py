@@ -15,7 +15,6 @@ from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
-    avatar_box,
     find_unknown_regions,
     make_plan_space,
     plan_segments,
@@ -119,7 +118,7 @@ def sweep_steps(
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    box, scratch = avatar_box(avatar.arrays), make_scratch(avatar.arrays)
+    box, scratch = avatar.box, make_scratch(avatar.arrays)
     # The default tolerance is the rounding of an interval: such a sweep is an exact request.
     level = find_level(data, budget if tolerance > DEFAULT_TOLERANCE else budget._replace(tolerance=0.0))
     settled: NDArray[np.bool_] = np.zeros(k, bool)
@@ -182,8 +181,6 @@ def sweep_steps(
         unknown[:] = 0.0
     met = unknown <= until
     proved[met] = np.minimum(proved, unknown)[met]
-    if part is None and ((proved < 1.0).any() or (progress.upper < np.inf).any()):
-        budget.lacked(len(spent.late))
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return structs.replace(answers, **spent.fields())

@@ -1,7 +1,5 @@
 """Query `within`: the scan point nearest to each query point."""
 
-import time
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +28,7 @@ def within_steps(
     units, leaves the box of all scan points. Verdicts and bounds are as for `raycast`.
     Raise BadRequestError.
     """
-    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    spent = CostCounter(data)
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:

@@ -1,6 +1,7 @@
 """Frames of a single effect: a world of archives, a body, and the effect's report at a pose."""
 
 import os
+from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -64,8 +65,10 @@ def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
 def placed(scene: Scene, pose: Any = None) -> Any:
     """Return the first archive of a scene, placed at a pose; None: the identity."""
     archive, pose = scene.archives[0], archive_pose(pose)
-    inverse = None if pose is None else inverse_pose(pose)
-    return SimpleNamespace(take=archive.take, info=archive.info, pose=pose, inverse=inverse)
+    there: Any = copy(archive)
+    there.take, there.info, there.pose = archive.take, archive.info, pose
+    there.inverse = None if pose is None else inverse_pose(pose)
+    return there
 
 
 def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:

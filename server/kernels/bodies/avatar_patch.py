@@ -32,13 +32,11 @@ def add_difference(x, y, z, sums):
 
 
 @nb.njit(nogil=True, cache=True)
-def lowest_heights(body, order, surface, point, reach, directions, heights, sums):
-    """Find how low an avatar's points near one of them lie along directions.
+def lowest_heights(body, point, reach, directions, heights, sums):
+    """Find how low the points of an avatar's surface near one of them lie along directions.
 
     body: reference to the avatar's arrays.
-    order: (b, LANES) int32, number of the point in each lane of a block.  surface: number of the
-    points of its surface; those after them are inside, and left out.
-    point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
+    point: (3,) a place on the surface, avatar frame [m].  reach: inclusive [m].
     directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
     within reach, relative to `point` [m]; 0 if there are none.
     sums: (SUMS,) int64, set to the sums for `normal_code` (kernels/core/normal_codes.py), in
@@ -68,7 +66,7 @@ def lowest_heights(body, order, surface, point, reach, directions, heights, sums
             px = avatar.points[~first, 0, j] - x
             py = avatar.points[~first, 1, j] - y
             pz = avatar.points[~first, 2, j] - z
-            if px * px + py * py + pz * pz > square or order[~first, j] >= surface:
+            if px * px + py * py + pz * pz > square or body.rows[~first, j] >= body.surface:
                 continue
             for k in range(directions.shape[0]):
                 height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]

@@ -7,6 +7,9 @@ holds them for compiled code: it is taken apart once, when it is made.
 
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ....schemas.kernels import compiling as nb
 from .placed_avatar import Avatar
 from .reach import VoxelTree
@@ -23,9 +26,14 @@ if nb.config.DISABLE_JIT:
         one: OneReach
 
     class AvatarReference(NamedTuple):
-        """Arrays of an avatar."""
+        """Arrays of an avatar, see `refer_to_avatar`."""
 
         avatar: Avatar
+        rows: NDArray[np.int32]
+        surface: int
+        points: NDArray[np.float64]
+        radius: float
+        box: NDArray[np.float64]
 
 else:
 
@@ -41,10 +49,12 @@ else:
         """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
 
     class AvatarReference(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Arrays of an avatar."""
+        """Arrays of an avatar, see `refer_to_avatar`."""
 
     nb.structref.define_proxy(SceneReference, _SceneReferenceType, ["scene", "tree", "one"])
-    nb.structref.define_proxy(AvatarReference, _AvatarReferenceType, ["avatar"])
+    nb.structref.define_proxy(
+        AvatarReference, _AvatarReferenceType, ["avatar", "rows", "surface", "points", "radius", "box"]
+    )
 
 
 @nb.njit(nogil=True, cache=True)
@@ -54,9 +64,14 @@ def refer_to_scene(scene, tree, one):
 
 
 @nb.njit(nogil=True, cache=True)
-def refer_to_avatar(avatar):
-    """Return a reference to the arrays of an avatar."""
-    return AvatarReference(avatar)
+def refer_to_avatar(avatar, rows, surface, points, radius, box):
+    """Return a reference to the arrays of an avatar.
+
+    rows: (b, LANES) int32, number of the point in each lane of a block.  surface: number of the points
+    of its surface; those after them are inside.  points: (n, 3), avatar frame [m].  radius: of its
+    spheres [m].  box: (2, 3) around its points; zeros if it has none.
+    """
+    return AvatarReference(avatar, rows, surface, points, radius, box)
 
 
 @nb.njit(nogil=True, cache=True)

@@ -16,7 +16,7 @@ from ..core.voxels_in_reach import VALID, check_poses
 from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments
-from .sweep_segments import avatar_box, find_unknown_regions, plan_segments
+from .sweep_segments import find_unknown_regions, plan_segments
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -31,37 +31,29 @@ OPEN, STAYS, PROVED = 0.0, 1.0, 2.0
 
 
 @nb.njit(nogil=True, cache=True)
-def box_of(avatar):
-    """Return `avatar_box` of an avatar, not empty."""
-    return avatar_box(avatar)
-
-
-@nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown_everywhere, tolerance, skin,
-    result,
+    pose_from, pose_to, body, scratch, other_units, held, stop, unknown_everywhere, tolerance, skin, result
 ):  # fmt: skip
     """Sweep one motion if it is short and all voxels in its reach are resident.
 
     pose_from, pose_to: (4, 4) world, unchecked.  body, held: references to the arrays of an avatar
-    that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  box: `box_of` the
-    avatar.  stop: (1,) int64, the request's stop flag.  radius, other_units, tolerance: as in
-    kernels/motion/sweep_advance.py.  The dataset's origin is subtracted from the motion as in
-    server/queries/sweep.py.  skin: distance to keep from what is touched [m]; negative: the end of
-    the motion is not computed.
+    that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  stop: (1,) int64, the
+    request's stop flag.  other_units, tolerance: as in kernels/motion/sweep_advance.py.  The
+    dataset's origin is subtracted from the motion as in server/queries/sweep.py.  skin: distance to
+    keep from what is touched [m]; negative: the end of the motion is not computed.
     Writes held.one, the voxels in reach, and result (COLUMNS,) float64; the witness is written where
     the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
-    avatar, scene, tree, lists = body.avatar, held.scene, held.tree, held.one.reach.lists
+    avatar, box, scene, tree, lists = body.avatar, body.box, held.scene, held.tree, held.one.reach.lists
     one, origin = scratch.one, scene.origin
     first, last, units, progress, counts = one.first, one.last, one.units, one.progress, one.counts
     for r in range(4):
         for c in range(4):
             first[0, r, c], last[0, r, c] = pose_from[r, c], pose_to[r, c]
     for poses in (first, last):
-        fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, units)
+        fault, _, _ = check_poses(poses, avatar.radius, body.radius, other_units, scene, units)
         if fault != VALID:
             return _NOT_ANSWERED
     for r in range(3):

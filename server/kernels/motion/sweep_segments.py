@@ -62,20 +62,6 @@ def make_plan_space():
     return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty(REACH_STACK, np.int64))
 
 
-@nb.njit(nogil=True, cache=True)
-def avatar_box(avatar):
-    """Return the least and greatest coordinates (2, 3) of an avatar's points, not empty [m]."""
-    box = np.empty((2, 3))
-    for r in range(3):
-        least, most = avatar.points[0, r, 0], avatar.points[0, r, 0]
-        for block in range(avatar.points.shape[0]):
-            for j in range(avatar.points.shape[2]):
-                least = min(least, avatar.points[block, r, j])
-                most = max(most, avatar.points[block, r, j])
-        box[0, r], box[1, r] = least, most
-    return box
-
-
 @njit_no_refcount
 def avatar_size(box, units):
     """Return the size of an avatar with its reach, across [m].
@@ -134,7 +120,8 @@ def sagitta_of(motion, length, scene):
 def plan_segments(box, first, last, avatar, units, scene, tree, which, progress, lists, space, moved):
     """Plan the next segment of each motion in `which` that reaches any voxel, and list its voxels.
 
-    box: `avatar_box`.  first, last: (k, 4, 4), checked.  units: (k,), as `check_poses` writes them.
+    box: (2, 3) around the avatar's points.  first, last: (k, 4, 4), checked.  units: (k,), as
+    `check_poses` writes them.
     space: scratch.  moved: (w,) float64, one for each of `which`; scratch.
     Reads progress.at and advances it to the start of the segment; everything before is out of reach
     of all voxels. Writes end, speed and way. `at` becomes 1 for a motion with nothing left in reach,

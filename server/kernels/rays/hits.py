@@ -480,7 +480,7 @@ def nearest_in_memory(held, place, reach, stop, found):
         away = place[r] - scene.origin[r]
         units[0, r] = np.int64(np.rint(away * UNITS_PER_METRE))
         center[r] = away / scene.step
-    batch = HitBatch(units, np.empty((0, 3)), np.int64(np.rint(reach * UNITS_PER_METRE)), 0)
+    batch = HitBatch(units, np.empty((0, 3)), int(np.rint(reach * UNITS_PER_METRE)), 0)
     span = reach / scene.step + 1.0  # a step more exceeds what rounding loses
     count = list_item(
         held.tree, center, center, span, 0.0, stop, np.empty(REACH_STACK, np.int64), lists.rows, lists.near, 0

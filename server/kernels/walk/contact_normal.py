@@ -94,7 +94,6 @@ def _lowest(walk, hit, out, apart, normals, lowest, sums):
     for n in range(normals.shape[0]):
         _put(directions, n, rotate_back(pose, vector(normals[n])))
     point = walk.memory.tape[hit, POINT : POINT + 3]
-    avatar, reach = walk.avatar, walk.settings.normal_reach
-    lowest_heights(avatar.body, avatar.rows, avatar.surface, point, reach, directions, lowest, sums)
+    lowest_heights(walk.avatar, point, walk.settings.normal_reach, directions, lowest, sums)
     for n in range(normals.shape[0]):
         lowest[n] = lowest[n] + dot(out, vector(normals[n])) - apart

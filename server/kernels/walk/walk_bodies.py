@@ -148,7 +148,7 @@ def find_first_body(walk, standing, to, tolerance, below, until):
         count = _leave_out_beside(standing, count)
     row, fraction = -1, np.inf
     if count > 0:
-        avatar = walk.avatar.body.avatar
+        avatar = walk.avatar.avatar
         row, fraction = sweep_bodies(
             avatar, standing.box, standing.units, standing.ends[0], standing.ends[1], avatar, standing.poses,
             standing.units, standing.rows[:count], standing.origin, standing.margin_units, tolerance, np.inf,
@@ -179,7 +179,7 @@ def is_clear_of_bodies(walk, standing, pose):
     """Return whether no body is touched at a pose (4, 4); False also if Python has to be asked."""
     if walk.own == ASKS:
         return False
-    avatar = walk.avatar.body.avatar
+    avatar = walk.avatar.avatar
     units, poses = standing.units + standing.units + standing.margin_units, standing.poses
     for at in range(_near_bodies(standing, walk.own, pose, pose)):
         verdict = touch_bodies(

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
+from ..motion.motion_scratch import make_scratch
 from .slide_along import slide_command
 from .stand_on_ground import stand_on_ground
 from .step_up import step_up
@@ -56,8 +57,8 @@ def walk_frame(
     own: the avatar's row of them, -1 if it has none; ASKS if Python answers about bodies.
     """
     walk = Walk(
-        settings, avatar, memory, held, stop, unknown_everywhere, alone, native, bodies, other_units,
-        least_tolerance, tolerance_units, squares, standing, own,
+        settings, avatar, make_scratch(avatar.avatar), memory, held, stop, unknown_everywhere, alone, native, bodies,
+        other_units, least_tolerance, tolerance_units, squares, standing, own,
     )  # fmt: skip
     log = memory.log
     if log[REPEATS] != 0:

@@ -72,7 +72,7 @@ def farthest_motion(walk, pose_from, pose_to):
     """Return an approximate bound of the distance that any avatar point moves [m]."""
     if walk.avatar.points.shape[0] == 0:
         return 0.0
-    return longest_way(pose_from, pose_to, walk.avatar.body.avatar)
+    return longest_way(pose_from, pose_to, walk.avatar.avatar)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -135,12 +135,12 @@ def first_hit(walk, to, tolerance, skin, below):
 @nb.njit(nogil=True, cache=True)
 def _sweep(walk, to, tolerance, skin, row):
     """Write the scene's answer about a motion to a row; return whether it is known."""
-    memory, avatar = walk.memory, walk.avatar
+    memory = walk.memory
     result, pose = memory.tape[row], pose_now(walk)
     within = max(tolerance, walk.least_tolerance)
     needed, verdict, visits, _, _ = sweep_resident(
-        pose, to, avatar.body, avatar.scratch, avatar.radius, walk.other_units, avatar.box, walk.held, walk.stop,
-        walk.unknown_everywhere, within, skin, result[:VERDICT],
+        pose, to, walk.avatar, walk.scratch, walk.other_units, walk.held, walk.stop, walk.unknown_everywhere, within,
+        skin, result[:VERDICT],
     )  # fmt: skip
     if needed < 0:
         return False
@@ -173,7 +173,7 @@ def _collide(walk, pose):
         return -1
     copy_pose(pose, memory.one[0])
     fault, _, needed = collide_resident(
-        memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop,
+        memory.one, avatar, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop,
         memory.verdict, memory.counts,
     )  # fmt: skip
     if fault != VALID or needed < 0:

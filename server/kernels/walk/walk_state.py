@@ -50,6 +50,8 @@ KNOWN, ASKED, REPEATS, USED, MISSED, APART, VISITS = range(7)
 FOLLOW, SLIDE, STEP, GROUND = 1, 2, 4, 8
 PARTS = 4
 LOG = VISITS + PARTS
+# Limit of the voxels of a frame whose use is recorded.
+_MOST_USED = 256
 
 # Elements of `numbers`: next row of the tape, part, number of hits, row of the hit that ended the
 # motion command (-1: none), verdict, whether the pose is known to be clear; results of `ground`: whether
@@ -71,9 +73,8 @@ _SETTINGS = [
     "up", "continuous", "skin", "tolerance", "slides", "surfaces", "normal_reach", "lift", "walkable_slide",
     "step", "clearance", "near_reach", "down", "gravity", "max_speed", "walkable",
 ]  # fmt: skip
-_AVATAR = ["body", "rows", "surface", "scratch", "box", "points", "radius"]
 _WALK = [
-    "settings", "avatar", "memory", "held", "stop", "unknown_everywhere", "alone", "native", "bodies",
+    "settings", "avatar", "scratch", "memory", "held", "stop", "unknown_everywhere", "alone", "native", "bodies",
     "other_units", "least_tolerance", "tolerance_units", "squares", "standing", "own",
 ]  # fmt: skip
 
@@ -128,24 +129,14 @@ if nb.config.DISABLE_JIT:
         max_speed: float
         walkable: float
 
-    class WalkAvatar(NamedTuple):
-        """Arrays of an avatar, see `make_walk_avatar`."""
-
-        body: AvatarReference
-        rows: NDArray[np.int32]
-        surface: int
-        scratch: MotionScratch
-        box: NDArray[np.float64]
-        points: NDArray[np.float64]
-        radius: float
-
     WalkMemory = WalkArrays
 
     class Walk(NamedTuple):
         """All that a frame reads and writes, see `walk_frame`."""
 
         settings: WalkSettings
-        avatar: WalkAvatar
+        avatar: AvatarReference
+        scratch: MotionScratch
         memory: WalkMemory
         held: SceneReference
         stop: NDArray[np.int64]
@@ -167,10 +158,6 @@ else:
         """numba's type of `WalkSettings`."""
 
     @nb.structref.register
-    class _AvatarType(nb.types.StructRef):  # type: ignore[misc]
-        """numba's type of a `WalkAvatar`."""
-
-    @nb.structref.register
     class _MemoryType(nb.types.StructRef):  # type: ignore[misc]
         """numba's type of a `WalkMemory`."""
 
@@ -181,9 +168,6 @@ else:
     class WalkSettings(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
         """Options of a scene's effects, see `make_settings`."""
 
-    class WalkAvatar(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Arrays of an avatar, see `make_walk_avatar`."""
-
     class WalkMemory(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
         """State of a frame, see `make_arrays`."""
 
@@ -191,7 +175,6 @@ else:
         """All that a frame reads and writes, see `walk_frame`."""
 
     nb.structref.define_proxy(WalkSettings, _SettingsType, _SETTINGS)
-    nb.structref.define_proxy(WalkAvatar, _AvatarType, _AVATAR)
     nb.structref.define_proxy(WalkMemory, _MemoryType, list(WalkArrays._fields))
     nb.structref.define_proxy(Walk, _WalkType, _WALK)
 
@@ -217,18 +200,8 @@ def make_settings(
     )  # fmt: skip
 
 
-@nb.njit(nogil=True, cache=True)
-def make_walk_avatar(body, rows, surface, scratch, box, points, radius):
-    """Return the arrays of an avatar. body: reference.  scratch: of motions.  box: `box_of` it.
-
-    rows, surface: see `lowest_heights`.
-    points: (n, 3) float64, avatar frame [m].  radius: of its spheres [m].
-    """
-    return WalkAvatar(body, rows, surface, scratch, box, points, radius)
-
-
-def make_arrays(rows: int, voxels: int) -> WalkArrays:
-    """Allocate the state of a frame. rows: of the tape.  voxels: limit of the voxels of a query.
+def make_arrays(rows: int) -> WalkArrays:
+    """Allocate the state of a frame. rows: of the tape.
 
     tape: (rows, ROW).  log, numbers, values, inputs, poses: with the elements above.
     old_plane: point and normal of the plane that the avatar stood on.  old_raised: place of its last raise.
@@ -249,7 +222,7 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
         normals=np.zeros((rows, 4)),
         asked_poses=np.zeros((2, 4, 4)),
         asked=np.zeros(16),
-        used=np.zeros(4 * voxels, np.int64),
+        used=np.zeros(_MOST_USED, np.int64),
         verdict=np.zeros(1, np.uint8),
         counts=np.zeros((3, 1), np.uint32),
         one=np.zeros((1, 4, 4)),

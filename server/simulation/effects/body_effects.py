@@ -260,10 +260,12 @@ class ObjectPush:
         to = translated(begin, self._way)
         low = lowest_height(self._model, begin, self._bodies.up) if len(self._model.points) else 0.0
         swept = self._world.sweep(self._model, begin, to, _TOLERANCE, self._budget)
-        clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
-        stumbles = swept.cloud is not None and (
-            swept.lower == 0.0 or dot(swept.cloud, self._bodies.up) - low <= _LIFTS[-1]
-        )
+        clear, stumbles = 1.0, False
+        if swept is not None:
+            clear = swept.fraction
+            stumbles = swept.cloud is not None and (
+                clear == 0.0 or dot(swept.cloud, self._bodies.up) - low <= _LIFTS[-1]
+            )
         hit = self._others.sweep(self._model, begin, to, _TOLERANCE)
         if hit is not None and hit.fraction <= clear:
             clear, stumbles = hit.fraction, False
@@ -315,16 +317,13 @@ class ObjectPush:
         swept = self._world.sweep(self._model, pose, down, _TOLERANCE, self._budget)
         hit = self._others.sweep(self._model, pose, down, _TOLERANCE)
         lower = rose
-        if swept.avatar is not None and swept.cloud is not None:
-            touched = Hit(swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive)
-            normal = self._world.normal(touched, _SURFACE, self._budget)
+        if swept is not None and swept.verdict == Verdict.CONTACT:
+            normal = self._world.normal(swept, _SURFACE, self._budget)
             if normal is not None and dot(normal, up) < _LEVEL:
                 return None
-        if swept.verdict != Verdict.CLEAR or hit is not None:
-            free = min(
-                1.0 if hit is None else hit.fraction, 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
-            )
-            lower = free * deep - _SKIN
+        stops = [each.fraction for each in (swept, hit) if each is not None]
+        if stops:
+            lower = min(1.0, *stops) * deep - _SKIN
         if lower < _PUT_DOWN or self._touches_pusher(lowered := translated(pose, -lower * up)):
             return pose
         return lowered

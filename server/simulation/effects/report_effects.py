@@ -184,18 +184,15 @@ class ContactsRunner:
         # Most frames have no contact. This test takes a fifth of the time of an empty `contacts`.
         if scene_is_farther_than(frame, effect.margin):
             return ContactsReport()
-        of_archives = frame.world.contacts(
+        answers = frame.world.contacts(
             frame.body.avatar, frame.pose, 0, effect.margin, effect.cluster_distance, budget=frame.budget
         )
-        clusters = [cluster for answers in of_archives for cluster in _clusters(answers)]
-        if len(of_archives) > 1:
-            clusters.sort(key=lambda cluster: (cluster.deepest, cluster.cloud, cluster.avatar))
-        exact = all(answers.exact[0] for answers in of_archives)
-        return ContactsReport(clusters[: effect.limit], len(clusters), not exact)
+        clusters = list(_clusters(answers))
+        return ContactsReport(clusters[: effect.limit], len(clusters), not answers.exact[0])
 
 
 def _clusters(answers: ContactsAnswers) -> Iterator[ContactCluster]:
-    """Yield the clusters of one archive, deepest first."""
+    """Yield the clusters, deepest first."""
     columns = (
         answers.cluster_count, answers.cluster_deepest, answers.cluster_avatar, answers.cluster_cloud
     )  # fmt: skip

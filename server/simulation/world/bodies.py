@@ -37,20 +37,18 @@ _MAX_LOOSE_SHAPES = 64
 class Shape(NamedTuple):
     """Avatar's model with the data of the broad phase.
 
-    box: (2, 3) around its points, avatar frame [m]; zeros if it has no points.
     units: its radius, exact units.  number: of this shape among its `Bodies`.
     normals: normals computed so far, by point.
     """
 
     model: AvatarModel
-    box: NDArray[np.float64]
     units: int
     number: int
     normals: dict[int, Vec | None]
 
     def center(self, pose: Pose) -> Vec:
         """Return the placed centre of its box."""
-        placed: Vec = rotate(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
+        placed: Vec = rotate(pose, 0.5 * (self.model.box[0] + self.model.box[1])) + pose[:3, 3]
         return placed
 
     def normal_at(self, point: int) -> Vec | None:
@@ -119,9 +117,6 @@ class Bodies:
             return shape
         if len(self._known) > _MAX_LOOSE_SHAPES + len(self.names):
             self._known = {id(kept.model.points): kept for kept in self.shapes}
-        box = np.zeros((2, 3))
-        if len(model.points):
-            box = np.array([model.points.min(axis=0), model.points.max(axis=0)])
         units = to_units(model.radius, "radius")
         if units > MAX_REACH_UNITS // 4:
             raise BadRequestError(
@@ -134,7 +129,7 @@ class Bodies:
             self.scratch = make_body_scratch(nodes, blocks)
             self.scratch.counters[:] = counters
             self._changes += 1
-        shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
+        shape = self._known[id(model.points)] = Shape(model, units, self._numbered, {})
         self._numbered += 1
         return shape
 
@@ -203,7 +198,7 @@ class Bodies:
             made, radius = None, float(shape.model.radius)
             if (self.numbers[(self.kinds & wanted) != 0] == shape.number).all():
                 made = refer_to_bodies(
-                    shape.box, shape.units, margin_units, radius, radius + margin_units / UNITS_PER_METRE, wanted,
+                    shape.model.box, shape.units, margin_units, radius, radius + margin_units / UNITS_PER_METRE, wanted,
                     self.poses, self.bounds, self.kinds, self.origin, self.up, self.scratch,
                 )  # fmt: skip
             self._referred = key, made
@@ -266,7 +261,7 @@ class Bodies:
         self.poses[row] = pose
         shape = self.shapes[row]
         if len(shape.model.points):
-            bound_body(shape.box, self.poses[row], self.origin, shape.model.radius, self.bounds[row])
+            bound_body(shape.model.box, self.poses[row], self.origin, shape.model.radius, self.bounds[row])
         else:
             self.bounds[row, 0], self.bounds[row, 1] = np.inf, -np.inf
         if not begun:

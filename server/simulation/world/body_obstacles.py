@@ -196,7 +196,7 @@ class BodyObstacle:
         own = bodies.row_of(self._mover, user=self._user)
         more = shape.model.radius + self._margin_units / UNITS_PER_METRE
         count = find_near_bodies(
-            shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows
+            shape.model.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows
         )
         return rows[:count]
 
@@ -217,7 +217,7 @@ class BodyObstacle:
         pose: of the avatar, relative to the origin.
         """
         bodies, own = self._bodies, np.empty((2, 3))
-        bound_body(shape.box, pose, _NO_ORIGIN, shape.model.radius, own)
+        bound_body(shape.model.box, pose, _NO_ORIGIN, shape.model.radius, own)
         tops = np.maximum(bodies.bounds[rows, 0] * bodies.up, bodies.bounds[rows, 1] * bodies.up).sum(axis=1)
         heights = np.sort(own * bodies.up, axis=0).sum(axis=1)
         beside: NDArray[np.bool_] = tops > heights.mean()
@@ -242,7 +242,7 @@ class BodyObstacle:
             if len(other.model.points):
                 witness, named = np.empty((2, 3)), np.empty(2, np.int64)
                 row, fraction = sweep_bodies(
-                    shape.model.arrays, shape.box, shape.units, *ends, other.model.arrays, bodies.poses,
+                    shape.model.arrays, shape.model.box, shape.units, *ends, other.model.arrays, bodies.poses,
                     other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, witness, named,
                     bodies.scratch, self._stop.flag,
                 )  # fmt: skip

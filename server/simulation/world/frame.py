@@ -1,5 +1,6 @@
 """One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -32,6 +33,8 @@ class Hit(NamedTuple):
     rest: length of the motion that was left [m], if `unloaded`.
     end: (4, 4), pose at which a motion with a skin ends, which is proved clear for the scan; None if
     not known.
+    upper: fraction at which it certainly touches; inf if not known.  exact: whether no other contact
+    can come first, and no avatar point moves farther than the tolerance from `fraction` to `upper`.
     """
 
     fraction: float
@@ -45,6 +48,8 @@ class Hit(NamedTuple):
     unloaded: bool = False
     rest: float = 0.0
     end: Pose | None = None
+    upper: float = math.inf
+    exact: bool = True
 
 
 @dataclass(slots=True)

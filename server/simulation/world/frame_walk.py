@@ -23,7 +23,7 @@ from ...kernels.walk import walk_state as state
 from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
 from ...queries.request import EXACT
-from ...queries.resident_fast_path import MAX_FAST_VOXELS
+from ...queries.resident_fast_path import MAX_FAST_POINTS
 from .collision_world import SPARSE_FACTOR, World, normals_of
 from .frame import (
     Frame,
@@ -97,7 +97,7 @@ class FrameMemory(threading.local):
     """State of a frame of each thread."""
 
     def __init__(self) -> None:
-        self.use(state.make_arrays(_ROWS, MAX_FAST_VOXELS))
+        self.use(state.make_arrays(_ROWS))
 
     def use(self, memory: state.WalkArrays) -> None:
         """Take other arrays."""
@@ -106,7 +106,7 @@ class FrameMemory(threading.local):
     def grow(self) -> None:
         """Double the rows of the tape."""
         old, rows = self.memory, len(self.memory.tape)
-        larger = state.make_arrays(2 * rows, MAX_FAST_VOXELS)
+        larger = state.make_arrays(2 * rows)
         for name in state.WalkArrays._fields:
             part: NDArray[np.float64] = getattr(old, name)
             getattr(larger, name)[: len(part)] = part
@@ -254,10 +254,11 @@ class WalkCall:
         swept = world.sweep(
             avatar, frame.pose, translated(frame.pose, -deep * up), _FALL_TOLERANCE, frame.budget
         )
-        if frame.lacked > lacked and not (swept.verdict == Verdict.CONTACT and swept.exact):
+        touches = swept is not None and swept.verdict == Verdict.CONTACT
+        if frame.lacked > lacked and not (touches and swept.exact):
             result[state.UNLOADED] = 1.0
-        elif swept.verdict != Verdict.CONTACT:
-            result[state.ANSWER] = swept.verdict == Verdict.UNKNOWN
+        elif not touches:
+            result[state.ANSWER] = swept is not None
         else:
             # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
             result[state.ANSWER] = not stood or dot(swept.cloud, up) < feet - reach
@@ -358,10 +359,9 @@ class Walker:
         blocking = _only_obstacle(frame) if self.native and self._no_bodies is not None else None
         standing, own = self._no_bodies, state.ASKS
         with world as seen:
-            each, probe = seen[0], world.probe(body.avatar)
+            each, alone, avatar = seen[0], world.is_alone, body.avatar
             data, residency = each.data, each.data.residency
-            alone = world.is_alone
-            native = self.native and alone and probe.is_small
+            native = self.native and alone and 0 < len(avatar.points) <= MAX_FAST_POINTS
             squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
             held = data.references.to(data.arrays, data.tree)
             thread.memory.log[state.REPEATS] = 0
@@ -373,7 +373,7 @@ class Walker:
                             standing, own = blocking.reference(body.avatar) or (self._no_bodies, state.ASKS)
                         self._code.call(
                             walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
-                            self._settings, probe.walking, thread.reference, held.reference, data.arrays.stop,
+                            self._settings, avatar.reference, thread.reference, held.reference, data.arrays.stop,
                             data.nothing_clear, alone, native, bodies, data.radius_units,
                             tolerance, budget.tolerance_units, squares, standing, own,
                         )  # fmt: skip
@@ -382,7 +382,7 @@ class Walker:
                             rows = thread.memory.used[:used]
                             if log[state.REPEATS]:  # answering a query may have evicted some of them
                                 rows = rows[data.arrays.where[rows, 0] >= 0]
-                            probe.use(residency, rows.tolist())
+                            residency.use(rows.tolist())
                     break
                 except state.AskedError:
                     call.answer()

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
+from ...archives.ask_archives import HeldArchive
+from ...archives.rigid_transform import transform_points
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
 from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
 from ...queries.request import QueryBudget, parts_that_fit
-from .collision_world import HeldArchive, to_archive, to_world
 from .frame import (
     Frame,
     Hit,
@@ -66,10 +67,12 @@ class LeavingPose:
         """Gather the points that translations of frame.pose by up to `reach` [m] may meet."""
         self.pose, self.reach = frame.pose, reach
         world, avatar, budget = frame.world, frame.body.avatar, frame.budget
-        self._body = world.probe(avatar).body
+        self._body = avatar.reference
         with world as seen:
             self._seen = list(seen)
-            found = [self._gather(each, avatar, to_archive(each, frame.pose), budget) for each in seen]
+            found = [
+                self._gather(each, avatar, each.placed.poses_in(frame.pose[None])[0], budget) for each in seen
+            ]
         budget.lacked(sum(each.late for each in found))
         self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
         world.count(0, self.lacks)
@@ -129,7 +132,7 @@ class LeavingPose:
     def _heights(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the greatest heights (k,) of the avatar's centres along directions (k, 3) of its frame [m]."""
         heights = np.empty(len(directions))
-        self._body.call(kernel.find_heights, self._body.reference, directions, heights)
+        kernel.find_heights(self._body, directions, heights)
         return heights
 
     def _meet(self, behind: NDArray[np.float64], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -138,10 +141,9 @@ class LeavingPose:
         Points that are held, and those of surfaces behind planes (k, PLANE), are left out.
         """
         times, own = np.empty(len(self._points)), np.zeros((len(self._points), 3))
-        self._body.call(
-            kernel.meet_points, self._body.reference, self._box, self._points, self._reach, self._held,
-            behind, way, times, own,
-        )  # fmt: skip
+        kernel.meet_points(
+            self._body, self._box, self._points, self._reach, self._held, behind, way, times, own
+        )
         return times, own
 
     def _in_world(self, place: Vec) -> Vec:
@@ -188,7 +190,9 @@ class LeavingPose:
         end = self._end(to, fraction, local, own[at] - self._points[at], skin) if skin >= 0.0 else None
         number = int(self._archive[at])
         arrays = self._seen[number].data.arrays
-        cloud = to_world(self._seen[number], self._lattice[at] * arrays.step + arrays.origin)
+        cloud, pose = self._lattice[at] * arrays.step + arrays.origin, self._seen[number].placed.pose
+        if pose is not None:
+            cloud = transform_points(pose, cloud[None])[0]
         return Hit(
             fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
         )
@@ -232,28 +236,17 @@ def find_first_hit(
     skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
     below: for a search for ground, leave out bodies beside the avatar.
     """
-    found, lacked = None, frame.lacked
-    swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
-    if frame.verdict == Verdict.CONTACT and begins_in_contact(swept) and is_translation(frame.pose, to):
-        found = leave(frame, to, skin)
-    elif swept.verdict != Verdict.CLEAR:
-        sure = swept.verdict == Verdict.CONTACT
-        if sure and not swept.exact:
-            sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
-        if sure:
-            found = Hit(
-                swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive, None, swept.point, False,
-                0.0, swept.end,
-            )  # fmt: skip
-        else:
-            found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
+    lacked = frame.lacked
+    found: Hit | None = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget)
+    if found is not None:
+        if frame.verdict == Verdict.CONTACT and found.upper == 0.0 and is_translation(frame.pose, to):
+            found = leave(frame, to, skin)
+        elif found.verdict == Verdict.UNKNOWN or not (
+            found.exact or max_displacement(frame, to) * (found.upper - found.fraction) <= MAX_UNDECIDED
+        ):
+            found = Hit(found.fraction, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
     until = math.inf if found is None else found.fraction
     return first_body_hit(frame, to, tolerance, until, below=below) or found
-
-
-def begins_in_contact(swept: Any) -> bool:
-    """Return whether a `SweepResult` says that the scan is touched where the motion begins."""
-    return bool(swept.verdict == Verdict.CONTACT and swept.upper == 0.0)
 
 
 def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.bodies.avatar_patch import PATCH_STEPS, lowest_heights
-from solidcloud.server.kernels.core.array_references import refer_to_avatar
 from solidcloud.server.kernels.core.normal_codes import SUMS
 
 pytestmark = pytest.mark.interpreted
@@ -25,9 +24,7 @@ def test_heights_and_sums_are_those_of_the_surfaces_points_within_reach(
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     heights, sums = np.empty(3), np.empty(SUMS, np.int64)
     for at in points[: -inner : COUNT // 20]:
-        lowest_heights(
-            refer_to_avatar(model.arrays), model.rows, COUNT - inner, at, reach, directions, heights, sums
-        )
+        lowest_heights(model.reference, at, reach, directions, heights, sums)
         near = (points - at)[:-inner]
         near = near[(near**2).sum(axis=1) <= reach**2]
         np.testing.assert_allclose(heights, (near @ directions.T).min(axis=0), atol=1e-14)
@@ -40,5 +37,5 @@ def test_a_patch_without_points_has_no_height() -> None:
     model = make_avatar([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1)
     heights, sums = np.full(1, 7.0), np.full(SUMS, 7, np.int64)
     at, along = np.array([0.5, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])
-    lowest_heights(refer_to_avatar(model.arrays), model.rows, 2, at, 0.1, along, heights, sums)
+    lowest_heights(model.reference, at, 0.1, along, heights, sums)
     assert heights[0] == 0.0 and not sums.any()

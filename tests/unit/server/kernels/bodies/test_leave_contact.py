@@ -3,13 +3,12 @@
 import numpy as np
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.bodies import leave_contact as kernel
-from solidcloud.server.kernels.core.array_references import refer_to_avatar
 
 
 def test_heights_by_the_tree_are_those_of_all_centres(rng: np.random.Generator) -> None:
     for count in (1, 70, 3000):
         points = rng.normal(0.0, 0.4, (count, 3)) + np.array([7.0, -3.0, 0.5])
-        body, found = refer_to_avatar(make_avatar(points, 0.02).arrays), np.empty(len(kernel.DIRECTIONS))
+        body, found = make_avatar(points, 0.02).reference, np.empty(len(kernel.DIRECTIONS))
         kernel.find_heights(body, kernel.DIRECTIONS, found)
         x, y, z = points.T
         naive = [((a * x + b * y) + c * z).max() for a, b, c in kernel.DIRECTIONS]
@@ -19,7 +18,7 @@ def test_heights_by_the_tree_are_those_of_all_centres(rng: np.random.Generator) 
 def test_points_beside_the_way_meet_nothing(rng: np.random.Generator) -> None:
     """Every point is examined if the avatar's box is without end."""
     centres = rng.uniform(-0.3, 0.3, (400, 3))
-    body = refer_to_avatar(make_avatar(centres, 0.02).arrays)
+    body = make_avatar(centres, 0.02).reference
     points, reach = rng.uniform(-1.0, 1.0, (5000, 3)), rng.uniform(0.03, 0.05, 5000)
     box, none = np.array([centres.min(axis=0), centres.max(axis=0)]), np.zeros(5000, bool)
     met = 0

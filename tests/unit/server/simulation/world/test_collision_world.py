@@ -12,15 +12,16 @@ import pytest
 from effect_frames import body_of, placed, report
 from effect_rooms import at
 from late_frames import blocked_loads
+from msgspec import structs
 from solidcloud.schemas.scene.effect_table import Contacts, Slide
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.request import LateVoxels, QueryBudget
-from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import report_effects
+from solidcloud.server.simulation.world import collision_world
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Hit
 from split_scans import several
@@ -60,15 +61,17 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
         for begin, end in motions:
             found = world.sweep(BALL, begin, end)
             parts = [each.sweep(BALL, begin, end) for each in (first, alone)]
-            expected = min(parts, key=lambda each: each.lower)
-            seen.add((found.verdict, found.archive if found.verdict else 0))
-            assert found.verdict == expected.verdict
-            assert found.lower == pytest.approx(expected.lower, abs=1e-6)
-            if found.cloud is None or found.avatar is None:
+            touches = [each for each in parts if each is not None]
+            seen.add(None if found is None else found.archive)
+            assert (found is None) == (not touches)
+            if found is None:
                 continue
+            expected = min(touches, key=lambda each: each.fraction)
+            assert found.verdict == expected.verdict == Verdict.CONTACT
+            assert found.fraction == pytest.approx(expected.fraction, abs=1e-6)
+            assert found.avatar is not None and found.cloud is not None
             np.testing.assert_allclose(found.cloud, expected.cloud, atol=1e-3)
-            hit = Hit(found.lower, found.verdict, found.avatar, found.cloud, "", found.archive)
-            normal = world.normal(hit, 0.1 if not effect_rooms.INTERPRETED else 0.5)
+            normal = world.normal(found, 0.1 if not effect_rooms.INTERPRETED else 0.5)
             assert normal is not None and normal @ (found.avatar - found.cloud) > 0
             axis = 0 if found.archive == 0 else 1
             assert abs(normal[axis]) == pytest.approx(1.0, abs=1e-3)
@@ -79,7 +82,7 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
             nearest = world.nearest(found.cloud + 0.001, 0.05)
             assert nearest is not None and nearest.cloud is not None and nearest.archive == found.archive
             np.testing.assert_allclose(nearest.cloud, found.cloud, atol=1e-6)
-        assert seen == {(Verdict.CONTACT, 0), (Verdict.CONTACT, 1), (Verdict.CLEAR, 0)}
+        assert seen == {0, 1, None}
         assert world.collide(BALL, at(2, 0.1, 0.5)) == Verdict.CLEAR
         assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
         assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
@@ -108,7 +111,7 @@ def test_of_two_archives_at_the_same_distance_the_least_witness_is_named(
                 assert hit is not None and hit.cloud is not None
                 assert hit.cloud.tolist() == points[0].tolist()
             swept = world.sweep(ball, above, at(0, 0, 0))
-            assert swept.verdict == Verdict.CONTACT and swept.cloud is not None
+            assert swept is not None and swept.cloud is not None
             assert swept.cloud.tolist() == points[0].tolist()
             runner = report_effects.make(Contacts(cluster_distance=0.0), None)
             clusters = report(runner, world, body_of(ball), at(0, 0, 0)).clusters
@@ -143,12 +146,18 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
 ) -> None:
     """A graze just before the contact: all was looked at."""
     case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    found = SweepResult(Verdict.CONTACT, 0.2, 0.6, exact=False, unknown=unknown)
-    monkeypatch.setattr(ResidentQueries, "sweep", lambda *_: found)
+    ask = collision_world.sweep
+
+    def graze(*what: Any) -> Any:
+        return structs.replace(ask(*what), exact=np.zeros(1, bool), lower=np.full(1, 0.2))
+
+    monkeypatch.setattr(collision_world, "sweep", graze)
+    monkeypatch.setattr(collision_world, "has_unknown", lambda data: unknown)
     with Scene.open(case.archive) as scene:
         for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):
             world.begin(NO_STOP)
-            world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+            found = world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+            assert found is not None and not found.exact and found.fraction == 0.2 < found.upper
             assert world.unknown == unknown
 
 

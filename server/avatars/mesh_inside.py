@@ -142,7 +142,9 @@ def fill_inside(found: ClosedParts, small: _Floats, surface: _Floats, radius: fl
     if half < 2 or not 0 <= volume / max(4 * half**3, 1) <= 2 * MAX_AVATAR_POINTS:
         raise _too_large(what, radius)
     lattice = _Lattice(found, half)
-    inside = _nodes_inside(found, lattice, room, what, radius)
+    inside = _nodes_inside(found, lattice)
+    if inside is None or len(inside) > room:
+        raise _too_large(what, radius)
     feet = _feet(lattice, small, inside, radius)
     points = np.concatenate([lattice.places(inside), feet]) + 0.0
     number = _numbered(np.concatenate([surface, points]))
@@ -184,8 +186,8 @@ class _Lattice:
         return ((places - self._low) / self._step - self.first) / self.half
 
 
-def _nodes_inside(found: ClosedParts, lattice: _Lattice, room: int, what: str, radius: float) -> _Integers:
-    """Return the numbers of the nodes inside, sorted. room: their largest number."""
+def _nodes_inside(found: ClosedParts, lattice: _Lattice) -> _Integers | None:
+    """Return the numbers of the nodes inside, sorted; None if they are far too many."""
     crossings = [_crossings(found, lattice, odd) for odd in (0, 1)]
     column, part, height, way = (np.concatenate(each) for each in zip(*crossings, strict=True))
     order = np.lexsort((height, column, part))
@@ -197,7 +199,7 @@ def _nodes_inside(found: ClosedParts, lattice: _Lattice, room: int, what: str, r
     above = np.floor((height - odd) / 2).astype(np.int64)
     lengths = above[within + 1] - above[within]
     if lengths.sum() > 4 * MAX_AVATAR_POINTS:
-        raise _too_large(what, radius)
+        return None
     which, at = _expand(lengths)
     row = within[which]
     k = 2 * (above[row] + 1 + at) + odd[row]
@@ -209,10 +211,7 @@ def _nodes_inside(found: ClosedParts, lattice: _Lattice, room: int, what: str, r
     weight = np.where(holes & ~beyond[parts], -1, 1)
     # Parts that overlap enclose a node once.
     nodes, of = np.unique(numbers, return_inverse=True)
-    inside = nodes[np.bincount(of, weight, minlength=len(nodes)) > 0]
-    if len(inside) > room:
-        raise _too_large(what, radius)
-    return inside
+    return nodes[np.bincount(of, weight, minlength=len(nodes)) > 0]
 
 
 def _crossings(

@@ -48,7 +48,7 @@ from .distance import signed_from_square
 from .level_of_detail import find_level
 from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
 from .resolve import Steps, answered, resolve
-from .scene_data import SceneData, to_units, with_stop
+from .scene_data import SceneData, to_units, to_world, with_stop
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.
@@ -211,17 +211,9 @@ def _columns(
         "cluster_starts": cluster_starts, "cluster_count": clusters[:, PAIRS].copy(), "cluster_deepest": deepest,
         "cluster_avatar": cluster_avatar, "cluster_cloud": cluster_cloud,
         "cluster_scan": clusters[:, SCAN].astype(np.int32),
-        "cluster_low": _to_world(data, low), "cluster_high": _to_world(data, high),
+        "cluster_low": to_world(data, low), "cluster_high": to_world(data, high),
         "outside": reach.outside, "voxels_missing": missing, "node_visits": visits, "point_tests": tests,
     }  # fmt: skip
-
-
-def _to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return world positions (n, 3) [m] of lattice points, computed as `Lattice.to_world` does.
-
-    See schemas/archive/voxel_grid.py.
-    """
-    return np.asarray(lattice * data.arrays.step + data.arrays.origin)
 
 
 def _places(
@@ -234,6 +226,6 @@ def _places(
     avatar = records[:, CENTER : CENTER + 3] / UNITS_PER_METRE + data.arrays.origin
     return (
         avatar,
-        _to_world(data, records[:, POINT : POINT + 3]),
+        to_world(data, records[:, POINT : POINT + 3]),
         signed_from_square(records[:, SQUARE], radii - records[:, DEFICIT]),
     )

@@ -30,7 +30,7 @@ from ..kernels.nearest.nearest_search import nearest_poses
 from .level_of_detail import below, find_level, level_budget, level_reach
 from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
 from .resolve import Search, Steps, answered, drop_items, load_and_search, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
+from .scene_data import LevelOfDetail, SceneData, to_units, to_world, with_stop
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
@@ -255,9 +255,7 @@ def _columns(
     normal = np.divide(difference, length, out=np.zeros((len(found), 3)), where=length > 0)
     nowhere = ~found
     witness_avatar = nearest.pair[:, 3:] / UNITS_PER_METRE + origin
-    witness_cloud = (
-        nearest.pair[:, :3] * data.arrays.step + origin
-    )  # as schemas/archive/voxel_grid.py Lattice.to_world
+    witness_cloud = to_world(data, nearest.pair[:, :3])
     for column in (normal, witness_avatar, witness_cloud):
         column[nowhere] = np.nan
     return {

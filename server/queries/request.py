@@ -171,14 +171,24 @@ def make_budget(
 class CostCounter:
     """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
 
-    __slots__ = ("_begin", "_keys", "_residency", "faults", "hits", "late", "loaded", "misses", "waited")
+    __slots__ = (
+        "_begin",
+        "_keys",
+        "_residency",
+        "faults",
+        "hits",
+        "late",
+        "loaded",
+        "misses",
+        "wait_seconds",
+    )
 
     def __init__(self, data: SceneData) -> None:
         """Begin now with zero cost. data: of the scene that is queried."""
         self._begin, self._residency, self._keys = time.perf_counter(), data.residency, data.keys
         self.hits = self.misses = 0
         self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
-        self.waited = 0.0
+        self.wait_seconds = 0.0
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}
 
@@ -187,7 +197,7 @@ class CostCounter:
         found = held.hits - again - self.loaded
         self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
         self.misses += held.misses
-        self.waited += held.waited
+        self.wait_seconds += held.waited
         self.faults.update(dict.fromkeys(held.faults))
         self.late.update(dict.fromkeys(held.late))
 
@@ -196,10 +206,10 @@ class CostCounter:
         rows = [int(self._keys.searchsorted(key)) for key in cost.late]
         self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
 
-    def add_level(self, cost: "CostCounter") -> None:
+    def add_level(self, cost: "CostCounter | Cost") -> None:
         """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
-        self.waited += cost.waited
-        self.faults.update(cost.faults)
+        self.wait_seconds += cost.wait_seconds
+        self.faults.update(dict.fromkeys(cost.faults))
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of `Cost`; call it when the answer is complete."""
@@ -210,7 +220,7 @@ class CostCounter:
             "resident": self._residency.resident,
             "resident_bytes": self._residency.resident_bytes,
             "faults": tuple(self.faults),
-            "wait_seconds": self.waited,
+            "wait_seconds": self.wait_seconds,
             "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
         }
 

@@ -75,6 +75,11 @@ def to_units(metres: float, what: str) -> int:
     return round(metres * UNITS_PER_METRE)  # half to even
 
 
+def to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return world positions (n, 3) [m] of lattice points, as `Lattice.to_world` computes them."""
+    return np.asarray(lattice * data.arrays.step + data.arrays.origin)
+
+
 def make_tree(archive: Archive) -> VoxelTree:
     """Make the boxes around the points of an archive's voxels, as the index states them."""
     header, voxels = archive.header, archive.voxels

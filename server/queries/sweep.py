@@ -240,7 +240,6 @@ def _clear_until(
 ) -> Steps[NDArray[np.float64]]:
     """Return the fraction (k,) up to which the level proves that motions, world, touch none of its voxels."""
     covers = part.level.covers
-    own = CostCounter(covers)
     within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
     try:
         found = yield from sweep_steps(
@@ -248,8 +247,7 @@ def _clear_until(
         )
     except (BadRequestError, TooLargeError, StoppedError):  # cover spheres are larger than those of the scene
         return np.zeros(len(first))
-    own.add_cost(found)
-    spent.add_level(own)
+    spent.add_level(found)
     return np.zeros(len(first)) if covers.nothing_clear else found.lower
 
 

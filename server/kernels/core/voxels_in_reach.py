@@ -31,13 +31,11 @@ class VoxelsInReach(NamedTuple):
     units: (k,) int64, r_a + r_b + margin in exact units.
     lists: the voxels; `near` bounds the distance between centres, and `unseen` is that of scans that
     were left out.
-    boxes: (k, 2, 3) float64, the box of the root sphere and its reach [steps].
-    outside: (k,) bool, whether that box extends beyond the scene's box.
+    outside: (k,) bool, whether the box of the root sphere and its reach extends beyond the scene's box.
     """
 
     units: NDArray[np.int64]
     lists: VoxelLists
-    boxes: NDArray[np.float64]
     outside: NDArray[np.bool_]
 
 
@@ -60,7 +58,7 @@ def make_reach(k: int, rows: int) -> VoxelsInReach:
     lists = VoxelLists(
         np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty(rows), np.full(k, np.inf)
     )
-    return VoxelsInReach(np.empty(k, np.int64), lists, np.empty((k, 2, 3)), np.zeros(k, bool))
+    return VoxelsInReach(np.empty(k, np.int64), lists, np.zeros(k, bool))
 
 
 def make_one_reach() -> OneReach:
@@ -145,13 +143,13 @@ def voxels_in_reach(poses, avatar, scene, tree, reach):
     """List, for each pose, the voxels whose points the avatar's root sphere could touch, nearest first.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays.
-    Fills lists, boxes and outside of `reach` from its units. Returns how many rows are needed; those
+    Fills lists and outside of `reach` from its units. Returns how many rows are needed; those
     beyond the capacity are not written. Returns -1 when the scene's stop flag is set; `reach` is then
     not filled.
     The reach is widened by more than the rounding of this function: a millionth of itself, one
     step, and 2^-49 of the largest term of the sums.
     """
-    boxes, outside, lists, stack = reach.boxes, reach.outside, reach.lists, np.empty(REACH_STACK, np.int64)
+    outside, lists, stack = reach.outside, reach.lists, np.empty(REACH_STACK, np.int64)
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
     shift, center = np.empty(3), np.empty(3)
     needed = 0
@@ -165,8 +163,7 @@ def voxels_in_reach(poses, avatar, scene, tree, reach):
         outside[i] = False
         for r in range(3):
             center[r] = place(m, shift, r, x, y, z) / scene.step
-            boxes[i, 0, r], boxes[i, 1, r] = center[r] - span, center[r] + span
-            outside[i] |= boxes[i, 0, r] < tree.scene[0, r] or boxes[i, 1, r] > tree.scene[1, r]
+            outside[i] |= center[r] - span < tree.scene[0, r] or center[r] + span > tree.scene[1, r]
         own = root * (1.0 + 1e-6) + 1.0 + rounding
         lists.starts[i] = needed
         needed = list_item(tree, center, center, span, own, scene.stop, stack, lists.rows, lists.near, needed)

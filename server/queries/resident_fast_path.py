@@ -29,8 +29,8 @@ from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
-from ..kernels.nearest import nearest_resident as _nearest
-from ..kernels.nearest.nearest_resident import nearest_resident
+from ..kernels.nearest import nearest_search as _nearest
+from ..kernels.nearest.nearest_search import nearest_resident
 from ..residency.voxel_cache import VoxelCache
 from .collide import collide
 from .context.query_budget import EXACT, QueryBudget

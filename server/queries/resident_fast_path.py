@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
-from ..kernels.nearest import nearest_resident as _nearest
-from ..kernels.nearest.nearest_resident import nearest_resident
+from ..kernels.nearest import nearest_search as _nearest
+from ..kernels.nearest.nearest_search import nearest_resident
 from .collide import collide
 from .distance import distance
 from .request import EXACT, QueryBudget, kernel_poses, refuse

@@ -23,7 +23,7 @@ from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.core.reach import INFINITE, VoxelTree, entry_fraction, make_voxel_tree
 from solidcloud.server.kernels.core.scene_arrays import LANES, ROW_WORDS, SceneArrays
 from solidcloud.server.kernels.core.voxels_in_reach import VALID, find_reach, make_reach
-from solidcloud.server.kernels.nearest.block_distances import unmark_beyond_box
+from solidcloud.server.kernels.nearest.nearest_pair import unmark_beyond_box
 from solidcloud.server.queries import nearest_hits
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore

@@ -5,6 +5,10 @@ the same for all pairs, and the scan point's radius is the largest radius minus 
 class. The search therefore compares |a - b| + deficit. A bound on it, minus the deficit of a class,
 is a bound on |a - b| of the pairs of that class.
 
+The points of two leaf nodes are compared in float32, all LANES of a block in one vector step. Avatar
+points are placed: their coordinates are relative to the frame or to the block's low corner. Scene
+points are whole steps from the low corner of their block.
+
 Float32 separates nearly all pairs of points from the best one. The pairs it cannot separate are
 squared in integers (NUMERICS.md N5) and compared by separation_order.py. The least separation, and
 the pair that has it, are therefore those of the definition, for every tree and order.
@@ -17,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.kernel_decorators import njit_no_refcount
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_boxes import box_square, has_box
-from ..core.node_overlap import ONE_SLACK, SLACK, U32, make_thresholds
+from ..core.node_overlap import ONE_SLACK, SLACK, STACK, U32, make_thresholds
 from ..core.placed_avatar import lattice_to_units, place, to_units
 from ..core.scene_arrays import LANES, point_class
 from ..core.separation_order import compare_separations
-from .block_distances import write_squares
 
 U = np.uint64  # see placed_avatar.py
 # Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is
@@ -68,6 +71,10 @@ class BestPair(NamedTuple):
     candidates: (MAX_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
     candidate_squares: (MAX_CANDIDATES,) float32, their least squares there.
+    stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list of front nodes,
+    length.
+    below: (STACK,) int64, avatar nodes below its front; keys: (STACK,) float32, their lower bounds.
+    off: (3,) float32, from the frame to the voxel's low corner.
     """
 
     found: NDArray[np.int64]
@@ -85,6 +92,10 @@ class BestPair(NamedTuple):
     counters: NDArray[np.int64]
     candidates: NDArray[np.int64]
     candidate_squares: NDArray[np.float32]
+    stack: NDArray[np.int64]
+    below: NDArray[np.int64]
+    keys: NDArray[np.float32]
+    off: NDArray[np.float32]
 
 
 @nb.njit(nogil=True, cache=True)
@@ -98,7 +109,8 @@ def make_best_pair(deficit):
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), frame,
         np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
         np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MAX_CANDIDATES, 5), np.int64),
-        np.empty(MAX_CANDIDATES, np.float32),
+        np.empty(MAX_CANDIDATES, np.float32), np.empty((STACK, 3), np.int64), np.empty(STACK, np.int64),
+        np.empty(STACK, np.float32), np.empty(3, np.float32),
     )  # fmt: skip
 
 
@@ -121,6 +133,81 @@ def lower_bound(words, row, x, y, z, radius):
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
     return max(apart - both, gap / words[at + U(7)] - radius) - slack
+
+
+@njit_no_refcount
+def write_squares(halves, lane_at, x, y, z, squares):
+    """Write the squared distances (LANES,) of a scene block's points to a point.
+
+    x, y, z, and the block's points: relative to the block's low corner.
+    """
+    # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
+    # lanes).
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
+    for lane in range(LANES):
+        j = U(lane)
+        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
+        dz = np.float32(halves[at_z + j]) - z
+        squares[j] = dx * dx + dy * dy + dz * dz
+
+
+@njit_inlined
+def unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
+    """Unmark the points of an avatar's block that are beyond `far` from a scene block's box.
+
+    far: a squared distance. Other arguments as for `nearest_squares`.
+    No slack is added for rounding: rounding is monotonic, therefore each difference computed here
+    is no larger than those of the points.
+    """
+    h, b = U(lane_at), U(block)
+    high_x, high_y, high_z = np.int32(0), np.int32(0), np.int32(0)
+    for j in range(LANES):
+        i = h + U(j)
+        high_x = max(high_x, np.int32(halves[i]))
+        high_y = max(high_y, np.int32(halves[i + U(LANES)]))
+        high_z = max(high_z, np.int32(halves[i + U(2 * LANES)]))
+    most_x, most_y, most_z = np.float32(high_x), np.float32(high_y), np.float32(high_z)
+    zero = np.float32(0.0)
+    for lane in range(LANES):
+        u = U(lane)
+        x, y, z = lanes[b, 0, u] - low_x, lanes[b, 1, u] - low_y, lanes[b, 2, u] - low_z
+        dx, dy, dz = max(x - most_x, -x), max(y - most_y, -y), max(z - most_z, -z)
+        dx, dy, dz = max(dx, zero), max(dy, zero), max(dz, zero)
+        keep[u] = keep[u] & (dx * dx + dy * dy + dz * dz <= far)
+
+
+@njit_inlined
+def nearest_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
+    """Compute the least squared distance of each marked point of an avatar to a scene block.
+
+    lane_at: the scene block in `halves`.  low: its corner, relative to the frame. Writes squares.
+    Returns (least of all, points tested).
+    """
+    h, b = U(lane_at), U(block)
+    best, tested = np.float32(np.inf), 0
+    for eight in range(LANES // 8):
+        if keep8[U(eight)] == U(0):
+            continue
+        for lane in range(8 * eight, 8 * eight + 8):
+            if not keep[U(lane)]:
+                continue
+            tested += 1
+            x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
+            # The bits of non-negative floats sort like the numbers. The minimum of integers is
+            # vectorised; that of floats is not, because LLVM must allow for a NaN.
+            least = np.int32(0x7F800000)
+            for j in range(LANES):
+                i = h + U(j)
+                dx = np.float32(halves[i]) - x
+                dy = np.float32(halves[i + U(LANES)]) - y
+                dz = np.float32(halves[i + U(2 * LANES)]) - z
+                least = min(least, np.float32(dx * dx + dy * dy + dz * dz).view(np.int32))
+            bits = np.int32(least)
+            square = bits.view(np.float32)
+            squares[U(lane)] = square
+            best = min(best, square)
+    return best, tested
 
 
 @njit_no_refcount
@@ -246,20 +333,15 @@ def _distance_bound(square, frame):
 
 
 @njit_no_refcount
-def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
+def _list_by_class(c, block, block_at, lane_at, best, ints, halves, lanes):
     """Unmark the points of an avatar's block that are near no point of a scene block, by class.
 
     The radius class of each scene point decides.  c: class of the scene's leaf node.  Other
     arguments as for `take_candidates`. Returns an upper bound of the least |a - b| + deficit, exact
     units, float64; inf: no point is near.
     """
-    keep, squares, block_squares, far, deficit = (
-        best.keep,
-        best.squares,
-        best.block_squares,
-        best.far,
-        best.deficit,
-    )
+    keep, squares, block_squares, off = best.keep, best.squares, best.block_squares, best.off
+    far, deficit = best.far, best.deficit
     low_x = off[0] + np.float32(ints[block_at])
     low_y = off[1] + np.float32(ints[block_at + 1])
     low_z = off[2] + np.float32(ints[block_at + 2])
@@ -283,7 +365,7 @@ def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
 
 
 @njit_no_refcount
-def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
+def take_candidates(least, c, block, block_at, lane_at, best, points, m, shift, ints, halves, lanes):
     """Add the points that `nearest_squares` found to the candidates, and shrink the cut.
 
     This uses no integers. As points arrive and the cut shrinks, ten or twenty of them are the
@@ -295,7 +377,7 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
     if best.mask == U(0):
         within = _distance_bound(least, best.frame)
     else:
-        within = _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes)
+        within = _list_by_class(c, block, block_at, lane_at, best, ints, halves, lanes)
         if within == np.inf:
             return
     nearer = np.int64(within) + 2  # one unit for rounding up
@@ -314,24 +396,24 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
         if not keep[lane] or not squares[lane] <= far[c]:
             continue
         if counters[2] == MAX_CANDIDATES:
-            settle_candidates(best, points, m, shift, ints, halves, lanes, off)
+            settle_candidates(best, points, m, shift, ints, halves, lanes)
         at = counters[2]
         candidates[at, 0], candidates[at, 1], candidates[at, 2] = block, lane, block_at
         candidates[at, 3], candidates[at, 4] = lane_at, np.int64(c)
         candidate_squares[at] = squares[lane]
         counters[2] = at + 1
     if best.frame[5] > 0.0 or best.frame[6] > 0.0:
-        settle_candidates(best, points, m, shift, ints, halves, lanes, off)
+        settle_candidates(best, points, m, shift, ints, halves, lanes)
 
 
 @njit_no_refcount
-def settle_candidates(best, points, m, shift, ints, halves, lanes, off):
+def settle_candidates(best, points, m, shift, ints, halves, lanes):
     """Square the candidates of one voxel in integers and keep the nearest pair; clear the list.
 
-    points: (b, 3, LANES) of Avatar.  lanes: of PlacedAvatar.  off: (3,) float32, from the frame to
-    the voxel's low corner.
+    points: (b, 3, LANES) of Avatar.  lanes: of PlacedAvatar.
     """
     far, frame, found, squares, units = best.far, best.frame, best.found, best.block_squares, best.units
+    off = best.off
     for i in range(best.counters[2]):
         if best.candidate_squares[i] > far[best.candidates[i, 4]]:
             continue

@@ -271,7 +271,7 @@ def _read_records(path: str | Path) -> Iterator[Any]:
                     f"{path}: line {number}: its checksum is {found!r}: expected {stated!r} as in an unaltered file"
                 )
             try:
-                record = msgspec.json.decode(body, type=kind)
+                record: Any = msgspec.json.decode(body, type=kind)
             except msgspec.DecodeError as error:
                 raise CorruptError(f"{path}: line {number}: {error}: written by another version?") from None
             yield record

@@ -89,10 +89,11 @@ class World:
     """Collision world of one scene. Thread-safe.
 
     file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
-    walker: see `walker_of` in frame_walk.py.
+    walker: see `walker_of` in frame_walk.py.  bodies: see `bodies_of` in body_effects.py.
     """
 
     walker: Any = None
+    bodies: Any = None
 
     def __init__(self, scene: Any, file: SceneFile) -> None:
         """Create the world of a scene, an object with `archives` and `avatar` such as `Scene`."""

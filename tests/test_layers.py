@@ -60,7 +60,7 @@ ALLOWED = {
         "runtime avatars residency queries/context queries archives simulation/world"
     ),
     "server/simulation": (
-        "runtime scene_interface.py avatars queries/context queries archives simulation/world simulation/effects"
+        "runtime scene_interface.py avatars queries/context archives simulation/world simulation/effects"
     ),
     "server/scenes": (
         "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "

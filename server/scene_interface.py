@@ -1,21 +1,23 @@
 """Interface of a scene: the query methods of `Scene` and `Client`, and what a server requires.
 
-`Scene` and `Client` inherit `QueryMethods`. `ServedScene` is the interface that a server requires
-of a scene; the types before it are exchanged between the two. This file imports neither zenoh nor
-numba.
+`Scene` and `Client` inherit `QueryMethods`, and their sessions inherit `Session`. `ServedScene` is the
+interface that a server requires of a scene; the types before it are exchanged between the two. This
+file imports neither zenoh nor numba.
 """
 
 import threading
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
+from time import monotonic
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, Unpack
 
 import numpy as np
 from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
-from ..schemas.errors import SolidcloudError
+from ..schemas.errors import BadRequestError, BusyError, SolidcloudError
 from ..schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
@@ -28,7 +30,7 @@ from ..schemas.wire.answers import (
     WithinAnswers,
 )
 from ..schemas.wire.key_expressions import User
-from ..schemas.wire.motion_messages import Moved, State, Wish
+from ..schemas.wire.motion_messages import Late, Moved, State, Wish, motion_fields, object_poses
 from ..schemas.wire.overview_messages import OverviewAnswer
 from ..schemas.wire.question_rules import Question, suggestion_for
 from ..schemas.wire.question_table import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
@@ -46,6 +48,8 @@ _A = TypeVar("_A", bound=Cost)
 EVERYBODY = "*"
 # Owner of the avatars added in the serving process, not by a client.
 THIS_PROCESS = ""
+# States stored for `Session.states`: some ten seconds. The oldest are dropped.
+_MAX_STATES = 1024
 
 
 class QueryOptions(QuestionOptions, total=False):
@@ -250,6 +254,145 @@ class LatestState(State, frozen=True, eq=False, kw_only=True):
         return f"{State.__repr__(self)}, {self.age:.2g} s ago"
 
 
+class Session:
+    """Session of one avatar: sends motion commands, and keeps the states that result. Thread-safe.
+
+    The sessions of `Scene` and `Client` inherit it. They implement `_next_number` and `_send`, call `_keep`
+    with what results, and set `_open` while the session is open.
+    """
+
+    # Why no state came in time, for an error.
+    _no_state = ""
+
+    def __init__(self, scene: str, avatar: str, late: Late) -> None:
+        """Create a session. late: of its motion commands, as in `Wish`."""
+        self._scene, self._avatar, self._late = scene, avatar, late
+        self._commands = threading.Lock()  # held from numbering to sending, to keep the order
+        self._changed = threading.Condition()
+        self._kept: deque[State | SolidcloudError] = deque(maxlen=_MAX_STATES)
+        self._latest: State | None = None
+        self._error: SolidcloudError | None = None  # newer than `_latest`
+        self._received = 0.0  # time of `_latest`
+        self._open = False
+
+    def _next_number(self) -> int:
+        """Return the number of the next motion command, above all before."""
+        raise NotImplementedError
+
+    def _send(self, wish: Wish) -> None:
+        """Send a motion command. The caller holds `_commands`."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Return the avatar, the scene, and whether the session is open, in one line."""
+        latest, begun = self._latest, "open" if self._open else "closed"
+        state = "no state yet" if latest is None else f"{latest!r}, {monotonic() - self._received:.2g} s ago"
+        return f"<Session of {self._avatar!r} in {self._scene!r}: {begun}, {state}>"
+
+    def wish(
+        self,
+        pose: Any = None,
+        velocity: Any = None,
+        turn: float = 0.0,
+        *,
+        objects: Mapping[str, Any] | None = None,
+        time: float | None = None,
+    ) -> int:
+        """Send a motion command with either a pose or a velocity; return its number.
+
+        pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
+        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves, by
+        name.
+        time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
+        The state that results has the number as `seq`. Of a session in this process it is there when
+        this returns. Without a server, the command is lost and no states arrive: the last command is
+        sent again every second, for at most 5 s, until its state arrives.
+        Raise BadRequestError for an invalid command, or if the session is closed. `latest`, `wait` and
+        `states` raise the error of a refused frame.
+        """
+        poses, speed = motion_fields(pose, velocity)
+        moved = object_poses(objects)
+        with self._commands:
+            if not self._open:
+                raise BadRequestError(
+                    "this session is closed: wish inside `with scene.session(...) as session`"
+                )
+            wish = Wish(
+                seq=self._next_number(),
+                time=monotonic() if time is None else float(time),
+                pose=poses,
+                velocity=speed,
+                turn=float(turn),
+                objects=moved,
+                late=self._late,
+            )
+            self._send(wish)
+        return wish.seq
+
+    def _keep(self, found: State | SolidcloudError) -> None:
+        """Store a state or an error for `latest`, `wait` and `states`."""
+        with self._changed:
+            if isinstance(found, SolidcloudError):
+                self._error = found
+            else:
+                self._latest, self._error, self._received = found, None, monotonic()
+            self._kept.append(found)
+            self._changed.notify_all()
+
+    def _raise_error(self) -> None:
+        """Raise, once, the last error since the last state. The caller holds `_changed`."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def latest(self) -> LatestState | None:
+        """Return the last state, with its age; None before the first one.
+
+        Raise, once, the last error since that state.
+        """
+        with self._changed:
+            self._raise_error()
+            return (
+                None if self._latest is None else LatestState.of(self._latest, monotonic() - self._received)
+            )
+
+    def wait(self, seq: int, timeout: float = 5.0) -> State:
+        """Wait for the state of a motion command or of a newer one, and return it.
+
+        Raise BusyError if none comes within `timeout` [s]. Raise, once, the last error since the last
+        state.
+        """
+
+        def reached() -> bool:
+            return self._latest is not None and self._latest.seq >= seq
+
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._error) or not self._open or reached(), timeout)
+            self._raise_error()
+            if self._latest is None or self._latest.seq < seq:
+                raise BusyError(
+                    f"no state of wish {seq} of avatar {self._avatar!r} in scene {self._scene!r} within "
+                    f"{timeout:g} s{self._no_state}"
+                )
+            return self._latest
+
+    def states(self, timeout: float = 5.0) -> Iterator[State]:
+        """Yield states in order, until none comes for `timeout` [s] or the session is closed.
+
+        At most 1,024 states are stored; the oldest are dropped. Raise an error at its place among the
+        states.
+        """
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._kept) or not self._open, timeout)
+                if not self._kept:
+                    return
+                found = self._kept.popleft()
+            if isinstance(found, SolidcloudError):
+                raise found
+            yield found
+
+
 class ServedSimulation(Protocol):
     """Simulation of the frames of users that move in a scene; thread-safe."""
 
@@ -264,7 +407,6 @@ class ServedSimulation(Protocol):
         stop: StopFlag = NO_STOP,
     ) -> list[FrameResult]: ...
     def end(self, user: User) -> None: ...
-    def end_client(self, client: str) -> None: ...
 
 
 class ServedWatch(Protocol):

@@ -29,7 +29,7 @@ from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.effect_pipeline import Pipeline, make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
-from solidcloud.server.simulation.world.frame import Body, Frame, Runner
+from solidcloud.server.simulation.world.frame import Body
 
 Floats = NDArray[np.float64]
 
@@ -74,26 +74,12 @@ def towards(pose: Floats, wish: Floats) -> Floats:
     return nearer
 
 
-class Timed:
-    """Effect, and the duration of each of its frames [s]."""
-
-    def __init__(self, runner: Runner) -> None:
-        self.runner, self.name = runner, runner.name
-        self.seconds: list[float] = []
-
-    def run(self, frame: Frame) -> None:
-        """Run and time its part of one frame."""
-        begin = time.perf_counter()
-        self.runner.run(frame)
-        self.seconds.append(time.perf_counter() - begin)
-
-
 @dataclass
 class Walk:
     """Results of one walk.
 
     frames: (k,) duration of each frame [s].
-    effects: name -> (k,) duration of each frame in the effect [s], for timed walks.
+    effects: name -> (k,) duration of each frame in the effect [s], as the pipeline divides it.
     places: (k, 3) positions of the body.
     visits: node visits of all frames.
     """
@@ -132,19 +118,14 @@ class Stage:
             self._made[key] = world, make_pipeline(file, world)
         return self._made[key]
 
-    def walk(self, effects: Sequence[AnyEffect], *, timed: bool = False) -> Walk:
-        """Run the whole walk of one user.
-
-        timed: time each effect, which adds a tenth of a microsecond to each.
-        """
+    def walk(self, effects: Sequence[AnyEffect]) -> Walk:
+        """Run the whole walk of one user."""
         world, pipeline = self.pipeline(effects)
-        plain = pipeline.groups
-        alone = [Timed(runner) for group in plain for runner in group]
-        if timed:
-            pipeline.groups = [[runner] for runner in alone]
         body = Body("bench/one", self.avatar, self.poses[0].copy())
         took = np.empty(len(self.poses))
         places = np.empty((len(self.poses), 3))
+        spent = np.empty((len(self.poses) + 1, len(pipeline.stats())))
+        spent[0] = [each.seconds for each in pipeline.stats()]
         before = world.visits
         for number, pose in enumerate(self.poses):
             wish = towards(body.pose, pose)
@@ -152,11 +133,10 @@ class Stage:
             moved = pipeline.run(body, wish, FRAME)
             took[number] = time.perf_counter() - begin
             places[number] = moved.pose[0, :3, 3]
-        found = Walk(took, places=places, visits=world.visits - before)
-        if timed:
-            found.effects = {each.name: np.array(each.seconds) for each in alone}
-            pipeline.groups = plain
-        return found
+            spent[number + 1] = [each.seconds for each in pipeline.stats()]
+        names = [each.effect for each in pipeline.stats()]
+        each_frame = dict(zip(names, np.diff(spent, axis=0).T, strict=True))
+        return Walk(took, each_frame, places, world.visits - before)
 
     def crowd(self, effects: Sequence[AnyEffect], users: int) -> Floats:
         """Run the walk of several users, each some way behind the previous one.

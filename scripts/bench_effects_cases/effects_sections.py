@@ -46,7 +46,7 @@ def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.nda
             means[name].append(1e6 * found.frames.mean())
             medians[name].append(1e6 * float(np.median(found.frames)))
             worst[name].append(1e6 * float(np.percentile(found.frames, 99)))
-        stacked.append(stage.walk(EVERYTHING, timed=True).effects)
+        stacked.append(stage.walk(EVERYTHING).effects)
         clock.look_around()
     count = len(stage.poses)
     for name in sets:
@@ -55,7 +55,7 @@ def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.nda
         part.add(name, "frame", "p99", worst[name], "us", count)
     company = {name: np.median([each[name] for each in stacked], axis=0) for name in stacked[0]}
     for name, effects in ALONE.items():
-        own = [1e6 * stage.walk(effects, timed=True).effects[name].mean() for _ in range(min(loops, 3))]
+        own = [1e6 * stage.walk(effects).effects[name].mean() for _ in range(min(loops, 3))]
         beside = _name(tuple(effect for effect in effects if effect_name(effect) != name))
         part.add("an effect", name, f"own time, alone beside {beside}", own, "us", count)
         if name in company:

@@ -9,11 +9,10 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import fields, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -42,13 +41,10 @@ from ...schemas.wire.motion_messages import (
     Wish,
     checked_late,
 )
-from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ...schemas.wire.stats import EffectStats
-from ..archives.placed_archive import PlacedArchive
 from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
 from ..queries.request import LateVoxels, QueryBudget
-from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
 from .replay_log import FrameLog, LoggedTurn, take_record
@@ -76,20 +72,7 @@ _STOPPED.set("stopped when it was logged")
 _WARM = "*warm"
 
 
-class SimulatedScene(Protocol):
-    """Scene whose users are simulated."""
-
-    name: str
-    archives: list[PlacedArchive]
-
-    def info(self) -> SceneInfo: ...
-    def avatar(self, name: str, client: str) -> AvatarModel: ...
-    def add_avatar(
-        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
-    ) -> AvatarInfo: ...
-    def forget_client(self, client: str) -> None: ...
-
-
+@dataclass(slots=True)
 class _Presence:
     """User in the scene.
 
@@ -97,34 +80,23 @@ class _Presence:
     [s].
     """
 
-    __slots__ = ("body", "heard", "time")
-
-    def __init__(self, body: Body) -> None:
-        self.body = body
-        self.time: float | None = None
-        self.heard = 0.0
+    body: Body
+    time: float | None = None
+    heard: float = 0.0
 
 
 class Simulation:
     """Frames of a scene. Thread-safe.
 
-    scene: the scene of the users.  file: scene file.  pipeline: the effects that it declares.
-    bodies: updated after each frame; None if users cannot collide.
-    place: returns some scan point, (3,) world [m], for `warm`.
+    scene: the `Scene` of the users.  file: scene file.  pipeline: the effects that it declares; its
+    `bodies`, None if users cannot collide, are updated after each frame.
     """
 
-    def __init__(
-        self,
-        scene: SimulatedScene,
-        file: SceneFile,
-        pipeline: "Pipeline",
-        bodies: "Bodies | None" = None,
-        place: Callable[[], Any] | None = None,
-    ) -> None:
+    def __init__(self, scene: Any, file: SceneFile, pipeline: "Pipeline") -> None:
         self.scene, self.file, self._pipeline = scene, file, pipeline
         self._up = unit_vector(file.up)
         self._present: dict[User, _Presence] = {}
-        self._bodies, self._place = bodies, place
+        self._bodies: Bodies | None = pipeline.bodies
         self._recorder: FrameLog | None = None
         self._frames = 0
         self._frame = threading.Lock()  # held for a frame; bodies change only while it is held
@@ -146,7 +118,7 @@ class Simulation:
 
     def effect_stats(self) -> list[EffectStats]:
         """Return what each effect has cost so far, in the order in which they run."""
-        return self._pipeline.times.stats()
+        return self._pipeline.stats()
 
     def record(self, recorder: FrameLog | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
@@ -270,28 +242,51 @@ class Simulation:
         logged: LoggedTurn | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
-        there = self._present.get(user)
-        present = self._enter(user, command) if there is None else there
-        with ExitStack() as undo:
+        present = self._present.get(user) or self._enter(user, command)
+        body, bodies = present.body, self._bodies
+        with ExitStack() as undo:  # a command that is refused or stopped changes nothing
+            if bodies is not None:
+                undo.callback(bodies.restore, bodies.snapshot())
             if command.objects:
-                if self._bodies is None:
+                if bodies is None:
                     raise BadRequestError(
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
-                undo.callback(self._bodies.place_objects(command.objects, budget.stop))
+                undo.callback(bodies.place_objects(command.objects, budget.stop))
             if logged is None or logged.body is None:
-                run = partial(self._pipeline.run, budget=budget)
                 durations = frame_durations(command, present.time)
-                moved = run_frames(run, command, durations, present.body, self._up, self._bodies)
+                if len(durations) > 1:
+                    undo.callback(_restore, body, replace(body, effect_state=dict(body.effect_state)))
+                moved = self._run_frames(body, command, durations, budget)
             else:
-                moved = take_record(logged, present.body, self.world, self._bodies)
+                moved = take_record(logged, body, self.world, bodies)
             undo.pop_all()
         present.time = command.time
         present.heard = present.heard if now is None else now
         self._present[user] = present
-        if self._bodies is not None:
-            self._bodies[user] = present.body
+        if bodies is not None:
+            bodies[user] = body
         return moved
+
+    def _run_frames(self, body: Body, command: Wish, durations: list[float], budget: QueryBudget) -> Moved:
+        """Run the frames of a user's motion command, nearly always one. durations: as in `frame_durations`."""
+        moves: list[Moved] = []
+        for seconds in durations:
+            if moves and self._bodies is not None:
+                self._bodies[body.user] = body
+            target = target_pose(command, body.pose, seconds, self._up)
+            moves.append(self._pipeline.run(body, target, seconds, budget))
+        last = moves[-1]
+        if len(moves) == 1:
+            return last
+        touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
+        return msgspec.structs.replace(
+            last,
+            left=last.left if command.velocity is None else sum(moved.left for moved in moves),
+            touched=list(touched.values())[:MAX_TOUCHED],
+            stepped=sum(moved.stepped for moved in moves),
+            unknown=any(moved.unknown for moved in moves),
+        )
 
     def _enter(self, user: User, command: Wish) -> _Presence:
         """Return the presence of a new user. Raises BusyError if the scene is full."""
@@ -319,11 +314,6 @@ class Simulation:
         with self._frame:
             self._remove([user])
 
-    def end_client(self, client: str) -> None:
-        """Remove all users of a client."""
-        with self._frame:
-            self._remove([user for user in self._present if user.client == client])
-
     def drop_client(self, client: str) -> None:
         """Remove the bodies and avatars of a client that disconnected; see `Scene.drop_client`."""
         with self._frame:
@@ -338,7 +328,7 @@ class Simulation:
         Their motions lead onto a scan point from above, away from it, past it, and into another
         user.
         """
-        place = np.array(self.scene.info().bounds[0]) if self._place is None else self._place()
+        place = _find_scan_point(self.world)
         user, other = User(_WARM, "warm"), User(_WARM, "other")
         self.scene.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
         across = np.roll(self._up, 1)
@@ -401,84 +391,43 @@ def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
     return there
 
 
-def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
-    """Return the pose at which users enter."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
-    pose[:3, 3] = spawn.position
-    return pose
-
-
 def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
     """Return the pose at which a user enters with its first command.
 
     Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
     """
     if spawn is not None:
-        return spawn_pose(spawn, up)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
+        pose[:3, 3] = spawn.position
+        return pose
     if command.velocity is not None:
         raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
     return check_rigid(command.pose[0].copy(), "pose")
 
 
-def run_frames(
-    run: Callable[..., Moved],
-    command: Wish,
-    durations: list[float],
-    body: Body,
-    up: Vec,
-    bodies: "Bodies | None",
-) -> Moved:
-    """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
-
-    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may
-    meet, or None.
-    """
-    if len(durations) == 1:
-        return run(body, target_pose(command, body.pose, durations[0], up), durations[0])
-    body_before = replace(body, effect_state=dict(body.effect_state))
-    bodies_before = None if bodies is None else bodies.snapshot()
-    moves: list[Moved] = []
-    try:
-        for seconds in durations:
-            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds))
-            if bodies is not None:
-                bodies[body.user] = body
-    except BaseException:
-        for each in fields(body):
-            setattr(body, each.name, getattr(body_before, each.name))
-        if bodies is not None and bodies_before is not None:
-            bodies.restore(bodies_before)
-        raise
-    touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
-    last = moves[-1]
-    return msgspec.structs.replace(
-        last,
-        left=last.left if command.velocity is None else sum(moved.left for moved in moves),
-        touched=list(touched.values())[:MAX_TOUCHED],
-        stepped=sum(moved.stepped for moved in moves),
-        unknown=any(moved.unknown for moved in moves),
-    )
+def _restore(body: Body, before: Body) -> None:
+    """Restore the state of a body."""
+    for each in fields(body):
+        setattr(body, each.name, getattr(before, each.name))
 
 
-def make_simulation(scene: SimulatedScene, file: SceneFile) -> Simulation:
+def make_simulation(scene: Any, file: SceneFile) -> Simulation:
     """Return the simulation of a scene's frames, with the effects that `file` declares."""
     # Imported here, because a scene that is only queried needs neither effects nor their kernels.
     from .effects.effect_pipeline import make_pipeline
     from .world.collision_world import World
 
-    world = World(scene, file)
-    pipeline = make_pipeline(file, world)
-    return Simulation(scene, file, pipeline, pipeline.bodies, partial(_find_scan_point, world))
+    return Simulation(scene, file, make_pipeline(file, World(scene, file)))
 
 
-def _find_scan_point(world: Any) -> Any:
-    """Return some scan point of a world, (3,) [m]; its archive's least corner if none is found."""
+def _find_scan_point(world: "World") -> Vec:
+    """Return a scan point of a world, (3,) [m]; the least corner of a voxel's points if none is near it."""
     with world as held:
-        archive, data, pose = held[0].opened.store.archive, held[0].data, held[0].placed.pose
+        archive, pose = held[0].opened.store.archive, held[0].placed.pose
         lattice = archive.header.lattice
         corner = archive.coordinates[0] * lattice.voxel_steps + archive.voxels["low"][0]
-        place = lattice.to_world(corner[None])
-        found = within(data, place, min(16.0, 2 * lattice.voxel_size)).cloud_point
-        place = found if np.isfinite(found).all() else place
-        return (place if pose is None else transform_points(pose, place))[0]
+        places = lattice.to_world(corner[None])
+        place: Vec = (places if pose is None else transform_points(pose, places))[0]
+        hit = world.nearest(place, min(16.0, 2 * lattice.voxel_size))
+    return place if hit is None or hit.cloud is None else hit.cloud

@@ -7,8 +7,6 @@ Motion commands (`Wish` on the wire) are published, and states arrive as replies
 import logging
 import math
 import threading
-from collections import deque
-from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
@@ -16,12 +14,12 @@ from typing import Any, Self
 
 import zenoh
 
-from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, UnknownAvatarError
+from ...schemas.errors import BadRequestError, SolidcloudError, UnknownAvatarError
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, encode
-from ...schemas.wire.motion_messages import Late, State, Wish, motion_fields, object_poses
+from ...schemas.wire.motion_messages import Late, State, Wish
 from ..runtime.threads import start_loop
-from ..scene_interface import LatestState
+from ..scene_interface import Session
 from ..zenoh_common.endpoints import zenoh_words
 from ..zenoh_common.zenoh_settings import FRAME_QOS
 from .server_connection import ServerConnection
@@ -29,8 +27,6 @@ from .state_query import StateQuery, decode_reply
 
 log = logging.getLogger(__name__)
 
-# States stored for `states`: some ten seconds. The oldest are dropped.
-_MAX_STATES = 1024
 # Largest number of a motion command that `CommandNumbers.follow` accepts. Most programs store it as
 # int64, which must not overflow.
 _MAX_NUMBER = 1 << 62
@@ -63,13 +59,15 @@ class CommandNumbers:
                 self._last = seq
 
 
-class ClientSession:
+class ClientSession(Session):
     """Session of one avatar, made by `Client.session`; a context manager, thread-safe.
 
     `states` yields the server's states and errors in order, `latest` returns the last one. Without
     a server no states arrive, and the age of `latest` grows. When a server answers again, the
     session continues at the pose of the last state.
     """
+
+    _no_state = ": no server received it, or the server is slow: send further commands"
 
     def __init__(
         self,
@@ -84,8 +82,8 @@ class ClientSession:
         numbers: of motion commands, increasing over all sessions of this avatar.  late: of its
         motion commands, as in `Wish`.
         """
-        self._late = late
-        self._connection, self._scene, self._avatar, self._numbers = connection, scene, avatar, numbers
+        super().__init__(scene, avatar, late)
+        self._connection, self._numbers = connection, numbers
         self._session, self._user = connection.session, self._present_user()
         self._states = StateQuery(
             connection.session,
@@ -93,26 +91,14 @@ class ClientSession:
             connection.anchor,
             lambda: connection.avatars.digests([avatar]),
         )
-        self._publishing = threading.Lock()  # held from numbering to sending, to keep the order
         self._target: Any = None  # the pose last commanded; None after a velocity
         self._time = 0.0
         self._published = -math.inf  # time of the last one, on the monotonic clock
         self._last: Wish | None = None  # as it was sent
         self._sent = -math.inf  # time at which it was first sent
         self._answered = 0  # number of the last motion command that the server replied to
-        self._changed = threading.Condition()
-        self._kept: deque[State | SolidcloudError] = deque(maxlen=_MAX_STATES)
-        self._latest: State | None = None
-        self._error: SolidcloudError | None = None  # newer than `_latest`
-        self._received = -math.inf  # time of `_latest`
         self._refusals = 0
         self._stack: ExitStack | None = None
-
-    def __repr__(self) -> str:
-        """Return the avatar, the scene, and whether the session is open, in one line."""
-        latest, begun = self._latest, "closed" if self._stack is None else "open"
-        state = "no state yet" if latest is None else f"{latest!r}, {monotonic() - self._received:.2g} s ago"
-        return f"<Session of {self._avatar!r} in {self._scene!r}: {begun}, {state}>"
 
     def _present_user(self) -> key_expressions.User:
         """Return the user of this session under the client's present id."""
@@ -134,7 +120,7 @@ class ClientSession:
             # The thread ends after it has taken everything that arrived before the end.
             stack.callback(thread.join)
             stack.callback(self._states.end)
-            self._stack = stack.pop_all()
+            self._stack, self._open = stack.pop_all(), True
         return self
 
     def _declare_publisher(self) -> zenoh.Publisher:
@@ -155,7 +141,7 @@ class ClientSession:
         if user == self._user:
             return
         try:
-            with self._publishing:
+            with self._commands:
                 if self._stack is None:
                     return
                 self._publisher.delete()  # ends the avatar's body under the old id
@@ -173,8 +159,8 @@ class ClientSession:
 
     def close(self) -> None:
         """Leave the scene: the server removes the avatar's body. Closing twice is allowed."""
-        with self._publishing:
-            stack, self._stack = self._stack, None
+        with self._commands:
+            stack, self._stack, self._open = self._stack, None, False
             if stack is not None:
                 try:
                     self._publisher.delete()
@@ -185,47 +171,20 @@ class ClientSession:
             with self._changed:
                 self._changed.notify_all()
 
-    def wish(
-        self,
-        pose: Any = None,
-        velocity: Any = None,
-        turn: float = 0.0,
-        *,
-        objects: Mapping[str, Any] | None = None,
-        time: float | None = None,
-    ) -> int:
-        """Send a motion command with either a pose or a velocity; return its number.
+    def _next_number(self) -> int:
+        return self._numbers.next()
 
-        pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
-        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves, by
-        name.
-        time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
-        The state that results has the number as `seq`. Without a server, the command is lost and no
-        states arrive. The last command is sent again every second, for at most 5 s, until its state
-        arrives. Raise BadRequestError for an invalid command, or if the session is closed.
-        """
-        poses, speed = motion_fields(pose, velocity)
-        moved = object_poses(objects)
-        with self._publishing:
-            wish = Wish(
-                seq=self._numbers.next(),
-                time=monotonic() if time is None else float(time),
-                pose=poses,
-                velocity=speed,
-                turn=float(turn),
-                objects=moved,
-                late=self._late,
-            )
-            self._publish(wish)
-            self._sent, self._time = self._published, wish.time
-            if len(wish.pose):
-                self._target = wish.pose
-            elif self._latest is not None:
-                self._target = None
-        return wish.seq
+    def _send(self, wish: Wish) -> None:
+        """Send a motion command for the first time."""
+        self._publish(wish)
+        self._sent, self._time = self._published, wish.time
+        if len(wish.pose):
+            self._target = wish.pose
+        elif self._latest is not None:
+            self._target = None
 
     def _publish(self, wish: Wish) -> None:
-        """Publish a motion command. The caller holds `_publishing`."""
+        """Publish a motion command. The caller holds `_commands`."""
         if self._stack is None:
             raise BadRequestError("this session is closed: wish inside `with client.session(...) as session`")
         self._publisher.put(encode(wish))
@@ -233,7 +192,7 @@ class ClientSession:
 
     def _repeat(self) -> None:
         """Send the last motion command again if it, or its state, was dropped on the way."""
-        with self._publishing:
+        with self._commands:
             last, now = self._last, monotonic()
             if last is None or last.seq <= self._answered or self._stack is None:
                 return
@@ -242,61 +201,6 @@ class ClientSession:
                     self._publish(last)
                 except zenoh.ZError as error:  # the client was closed before
                     log.debug("sending again: %s", error)
-
-    def latest(self) -> LatestState | None:
-        """Return the last state, with its age; None before the first one.
-
-        Raise, once, the last error since that state.
-        """
-        with self._changed:
-            self._raise_error()
-            return (
-                None if self._latest is None else LatestState.of(self._latest, monotonic() - self._received)
-            )
-
-    def wait(self, seq: int, timeout: float = 5.0) -> State:
-        """Wait for the state of a motion command or of a newer one, and return it.
-
-        Raise BusyError if none arrives within `timeout` [s]. Raise, once, the last error since the
-        last state.
-        """
-        with self._changed:
-            self._changed.wait_for(
-                lambda: bool(self._error) or self._stack is None or self._reached(seq), timeout
-            )
-            self._raise_error()
-            if self._latest is None or self._latest.seq < seq:
-                raise BusyError(
-                    f"no state of wish {seq} of avatar {self._avatar!r} in scene {self._scene!r} within "
-                    f"{timeout:g} s: no server received it, or the server is slow: send further commands"
-                )
-            return self._latest
-
-    def _raise_error(self) -> None:
-        """Raise, once, the last error since the last state. The caller holds `_changed`."""
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
-
-    def _reached(self, seq: int) -> bool:
-        """Return whether the state of a motion command has arrived. The caller holds `_changed`."""
-        return self._latest is not None and self._latest.seq >= seq
-
-    def states(self, timeout: float = 5.0) -> Iterator[State]:
-        """Yield states in order, until none arrives for `timeout` [s] or the session is closed.
-
-        At most 1,024 states are stored; the oldest are dropped. Raise an error of the server at its
-        place among the states.
-        """
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: bool(self._kept) or self._stack is None, timeout)
-                if not self._kept:
-                    return
-                found = self._kept.popleft()
-            if isinstance(found, SolidcloudError):
-                raise found
-            yield found
 
     def _receive(self) -> None:
         """Take states and errors until the session ends. Runs in a thread."""
@@ -317,17 +221,13 @@ class ClientSession:
         """Store a state or an error for the methods that return it."""
         with self._changed:
             if isinstance(found, SolidcloudError):
-                self._error = found
                 self._answered = 0 if self._last is None else self._last.seq
             elif self._latest is not None and _is_same(found, self._latest):
                 return  # the server sent it twice
             else:
-                self._answered = max(self._answered, found.seq)
-                self._latest, self._error = found, None
+                self._answered, self._refusals = max(self._answered, found.seq), 0
                 self._numbers.follow(found.seq)
-                self._received, self._refusals = monotonic(), 0
-            self._kept.append(found)
-            self._changed.notify_all()
+            super()._keep(found)
 
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
         """Add the avatar and send its pose again to a server that does not know them.
@@ -345,7 +245,7 @@ class ClientSession:
             except UnknownAvatarError:
                 if self._latest is None:  # neither this client's avatar nor the scene's
                     raise
-            with self._publishing:
+            with self._commands:
                 pose = self._last_pose()
                 if pose is None or self._refusals > _MAX_REFUSALS:
                     raise unknown

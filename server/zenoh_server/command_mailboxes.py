@@ -88,12 +88,11 @@ class WaitingCommands:
 class MailboxContents(NamedTuple):
     """Contents taken out of the mailboxes.
 
-    left, gone: users and clients that leave; handled before the turns.
+    left: users that leave; handled before the turns.
     encodings: encoding of each turn's motion command, also used for its state.
     """
 
     left: list[User]
-    gone: list[str]
     turns: list[FrameCommand]
     encodings: list[str]
 
@@ -126,7 +125,6 @@ class Mailboxes:
         self._boxes: dict[User, _Box] = {}
         self._waiting: dict[User, None] = {}  # users with a motion command, in order of arrival
         self._left: dict[User, None] = {}  # users that leave, each once
-        self._gone: dict[str, None] = {}
         self._closed = False
         self._changed = threading.Condition()
 
@@ -165,18 +163,17 @@ class Mailboxes:
 
         A user without a mailbox is ignored.
         """
-        with self._changed:
-            if user not in self._boxes:
-                return
-            self._forget([user])
-            self._left[user] = None
-            self._changed.notify()
+        self._leave(lambda other: other == user)
 
     def leave_client(self, client: str) -> None:
         """Queue the departure of all users of a client."""
+        self._leave(lambda user: user.client == client)
+
+    def _leave(self, leaves: Callable[[User], bool]) -> None:
         with self._changed:
-            self._forget([user for user in self._boxes if user.client == client])
-            self._gone[client] = None
+            users = [user for user in self._boxes if leaves(user)]
+            self._forget(users)
+            self._left.update(dict.fromkeys(users))
             self._changed.notify()
 
     def keep(self, users: Iterable[User]) -> None:
@@ -193,18 +190,18 @@ class Mailboxes:
     def take(self) -> MailboxContents | None:
         """Wait until a mailbox has contents and take all; return None once closed and empty."""
         with self._changed:
-            while not (self._waiting or self._left or self._gone or self._closed):
+            while not (self._waiting or self._left or self._closed):
                 self._changed.wait()
-            if not (self._waiting or self._left or self._gone):
+            if not (self._waiting or self._left):
                 return None
-            post = MailboxContents(list(self._left), list(self._gone), [], [])
+            post = MailboxContents(list(self._left), [], [])
             for user in self._waiting:
                 box = self._boxes[user]
                 assert box.wish is not None, "only mailboxes with a motion command wait"
                 post.turns.append(FrameCommand(user, box.wish, box.late))
                 post.encodings.append(box.encoding)
                 box.wish = None
-            self._waiting, self._left, self._gone = {}, {}, {}
+            self._waiting, self._left = {}, {}
             return post
 
     def close(self) -> None:
@@ -298,8 +295,6 @@ class FrameLoop:
         """Simulate one frame and publish its states."""
         for user in post.left:
             self._simulation.end(user)
-        for client in post.gone:
-            self._simulation.end_client(client)
         if post.turns:
             outcomes = self._step(post.turns)
             for outcome, encoding in zip(outcomes, post.encodings, strict=True):

@@ -35,7 +35,6 @@ from solidcloud.schemas.wire.scene_messages import (
     SourceInfo,
 )
 from solidcloud.schemas.wire.stats import StatsAnswer
-from solidcloud.schemas.wire.warming_parts import MOTION
 from solidcloud.server.archives.scene_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
@@ -61,6 +60,8 @@ class FloorPipeline:
 
     An avatar named "crash" raises an error; the states of one named "large" are large.
     """
+
+    bodies = None
 
     def __init__(self):
         self.frames = 0
@@ -119,8 +120,6 @@ class FloorScene:
 
     def warm(self, *parts):
         self.warmed += 1
-        if MOTION in parts and self.simulation is not None:
-            self.simulation.warm()
         if self.never_warm in parts:
             compiling._progress.begin()
             print(f"warming {self.never_warm}", flush=True)

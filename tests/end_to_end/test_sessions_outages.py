@@ -71,7 +71,7 @@ def test_a_killed_client_leaves_the_scene(served, endpoint):
         assert [user.avatar for user in served.users] == ["large"]
         other.kill()
         eventually(lambda: not served.users)
-    _, client = served.scene.gone  # the first is the client that warmed the scene
+    (client,) = served.scene.gone
     assert client != "*warm" and not served.scene.avatars
 
 

@@ -22,21 +22,20 @@ lead deeper: the object first leaves them, along their normals, by as little.
 Contacts are recomputed only for objects that have moved. server/queries/objects.py defines contact.
 """
 
-from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_table import Crowd, Objects
-from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.request import QueryBudget
 from ...queries.scene_data import to_units
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
 from ..world.body_obstacles import BodyObstacle, warm_kernels
-from ..world.frame import Frame, Hit, Pose, Vec, lowest_height, translated
+from ..world.frame import Frame, Hit, Pose, Run, Vec, lowest_height, translated
 from ..world.vectors import dot, horizontal, norm
 
 # Largest permitted margin of `crowd` [m].
@@ -69,45 +68,50 @@ _LEVEL = 0.94
 _MAX_CONTACTS, _SAME_CONTACT = 4, 0.9
 
 
-def make(effect: Objects | Crowd, world: Any) -> "ObjectsRunner | CrowdRunner":
+def make(effect: Objects | Crowd, world: Any) -> Run:
     """Create an effect of a scene. Raise BadRequestError for a margin that is too large."""
     warm_kernels()
     if isinstance(effect, Objects):
-        return ObjectsRunner(world, world.file.objects)
+        return ObjectsRunner(world, bodies_of(world)).run
     if effect.margin > _MAX_MARGIN:
         raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MAX_MARGIN:g} m")
-    with world as seen:
-        bodies = Bodies(seen[0].data.arrays.origin, world.up)
-    return CrowdRunner(bodies, to_units(effect.margin, "margin"))
+    return partial(_add_users, bodies_of(world), to_units(effect.margin, "margin"))
 
 
-class CrowdRunner:
-    """Effect that adds the other users to the obstacles of a frame.
+def bodies_of(world: Any) -> Bodies:
+    """Return the bodies of a scene, which its effects share. They begin with the objects of its file."""
+    if world.bodies is None:
+        with world as seen:
+            world.bodies = Bodies(seen[0].data.arrays.origin, world.up, partial(_add_objects, world))
+    bodies: Bodies = world.bodies
+    return bodies
 
-    bodies: the simulation updates them, and may replace them by those of another effect.
+
+def _add_objects(world: Any, bodies: Bodies) -> None:
+    """Add the objects of a scene at their initial poses."""
+    for item in world.file.objects:
+        model = world.avatar(item.avatar)
+        bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+
+
+def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
+    """Add the other users to the obstacles; the report counts those that block.
+
+    margin_units: distance between users, exact units.
     """
-
-    name = "crowd"
-
-    def __init__(self, bodies: Bodies, margin_units: int) -> None:
-        """Create the effect. margin_units: distance between users, exact units."""
-        self.bodies, self._margin_units = bodies, margin_units
-
-    def run(self, frame: Frame) -> None:
-        """Add the other users to the obstacles; the report counts those that block."""
-        self.bodies.begin()
-        frame.reports[self.name] = CrowdReport()
-        frame.obstacles.append(UserObstacle(self.name, self.bodies, frame, self._margin_units))
+    bodies.begin()
+    frame.obstacles.append(UserObstacle(bodies, frame, margin_units))
+    return CrowdReport()
 
 
 class UserObstacle(BodyObstacle):
     """Obstacle formed by the other users; it counts those that ended a motion."""
 
-    def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
+    def __init__(self, bodies: Bodies, frame: Frame, margin_units: int) -> None:
         """Create the obstacle for one frame of one user."""
         body, stop = frame.body, frame.budget.stop
         super().__init__(
-            name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
+            "crowd", bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
         )
         self._met: set[str] = set()
 
@@ -126,25 +130,14 @@ class ObjectsRunner:
     Not thread-safe, except for queries of `Bodies`.
     """
 
-    name = "objects"
-
-    def __init__(self, world: Any, items: Sequence[ObjectItem]) -> None:
-        """Create the effect. items: the objects at their initial poses."""
-        self._world = world
-        with world as seen:
-            self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._add_initial)
-        self._items = list(items)
+    def __init__(self, world: Any, bodies: Bodies) -> None:
+        """Create the effect."""
+        self._world, self.bodies = world, bodies
         # State for which the contacts of each row were computed: clock of its last move, archives.
         self._computed_for: dict[int, tuple[int, tuple[int, ...]]] = {}
         self._contacts: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
 
-    def _add_initial(self, bodies: Bodies) -> None:
-        """Add the objects at their initial poses."""
-        for item in self._items:
-            model = self._world.avatar(item.avatar)
-            bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
-
-    def run(self, frame: Frame) -> None:
+    def run(self, frame: Frame) -> ObjectsReport:
         """Add the objects to the obstacles, and report their moves and contacts.
 
         The report covers the moves since the user's previous frame.
@@ -152,30 +145,22 @@ class ObjectsRunner:
         bodies = self.bodies
         with bodies.lock:
             bodies.begin()
-            since, frame.effect_state[self.name] = frame.body.effect_state.get(self.name, 0), bodies.clock
+            since, frame.effect_state["objects"] = frame.body.effect_state.get("objects", 0), bodies.clock
             frame.obstacles.append(ObjectObstacle(self, frame, since))
-            frame.reports[self.name] = self.report(since, frame.budget)
+            return self.report(since, frame.budget)
 
     def report(self, since: int, budget: QueryBudget) -> ObjectsReport:
         """Return the objects that moved since a count of moves, and the contacts."""
         bodies = self.bodies
-        poses = {
-            bodies.names[row]: bodies.poses[row].tolist()
-            for row in self._objects()
-            if bodies.changed[row] > since
-        }
+        rows = np.flatnonzero(bodies.kinds != USER).tolist()  # they precede those of users
+        poses = {bodies.names[row]: bodies.poses[row].tolist() for row in rows if bodies.changed[row] > since}
         names = {-1: ""} | dict(enumerate(bodies.names))
-        return ObjectsReport(
-            poses, [(names[one], names[other]) for one, other in self._find_contacts(budget)]
-        )
+        contacts = self._find_contacts(rows, budget)
+        return ObjectsReport(poses, [(names[one], names[other]) for one, other in contacts])
 
-    def _objects(self) -> list[int]:
-        """Return the objects' rows, which precede those of users."""
-        return np.flatnonzero(self.bodies.kinds != USER).tolist()
-
-    def _find_contacts(self, budget: QueryBudget) -> list[tuple[int, int]]:
-        """Return the contacts, by rows; recompute those of objects that have moved."""
-        bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
+    def _find_contacts(self, rows: list[int], budget: QueryBudget) -> list[tuple[int, int]]:
+        """Return the contacts of objects, by rows; recompute those of objects that have moved."""
+        bodies, archives = self.bodies, self._world.generations()
         for row in rows:
             now = bodies.changed[row], archives
             if self._computed_for.get(row) == now:
@@ -196,35 +181,22 @@ class ObjectsRunner:
             self._computed_for[row] = now
         return sorted(self._contacts)
 
-    def push(self, name: str, way: Vec, pusher: Frame) -> bool:
-        """Move an object by a horizontal displacement (3,) [m], as far as it touches nothing.
-
-        Return whether it moved.
-        pusher: frame of the user that pushes and follows, who is not an obstacle of the object.
-        """
-        bodies, budget = self.bodies, pusher.budget
-        row, length = bodies.row_of(name, user=False), norm(way)
-        if length < _MIN_PUSH:
-            return False
-        push = ObjectPush(self, row, way, pusher)
-        to = push.result()
-        if to is None or budget.stop:
-            return False  # if stopped, the result may be incomplete
-        bodies.put(row, to)
-        return True
-
 
 class ObjectPush:
     """One push of an object: where the object ends."""
 
-    def __init__(self, runner: ObjectsRunner, row: int, way: Vec, pusher: Frame) -> None:
-        """Prepare the push. row: of the object.  way: (3,) horizontal [m].  pusher: frame."""
-        bodies, user = runner.bodies, pusher.body.name
+    def __init__(self, bodies: Bodies, row: int, way: Vec, pusher: Frame) -> None:
+        """Prepare the push.
+
+        row: of the object.  way: (3,) horizontal [m].
+        pusher: frame of the user that pushes and follows, who is not an obstacle of the object.
+        """
+        user = pusher.body.name
         self._bodies, self._row, self._way, self._length = bodies, row, way, norm(way)
         self._world, self._budget, self._pusher = pusher.world, pusher.budget, pusher
         self._model, self._pose = bodies.shapes[row].model, bodies.poses[row].copy()
         self._others = BodyObstacle(
-            runner.name, bodies, USER | KINEMATIC | PUSHED, bodies.names[row], self._model, self._pose,
+            "objects", bodies, USER | KINEMATIC | PUSHED, bodies.names[row], self._model, self._pose,
             user=False, skip=user, stop=pusher.budget.stop,
         )  # fmt: skip
 
@@ -346,29 +318,30 @@ class ObjectObstacle(BodyObstacle):
         """Create the obstacle for a frame. since: clock of the last moves reported to its user."""
         body, stop = frame.body, frame.budget.stop
         super().__init__(
-            runner.name, runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
+            "objects", runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
         )
         self._runner, self._since = runner, since
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
         """Push the object that ended the motion by the rest of the way; return whether it moved.
 
-        Only pushable objects move. `Simulation.move`, which keeps no state, pushes no object.
+        Only pushable objects move, as far as they touch nothing. `Simulation.move`, which keeps no state,
+        pushes no object.
         """
         bodies = self._runner.bodies
-        if not self.is_own(hit):
+        if not self.is_own(hit) or hit.avatar is None or hit.cloud is None:
             return False
         with bodies.lock:
             row = bodies.row_of(hit.what, user=False)
             if row < 0 or bodies.kinds[row] != PUSHED or not bodies.is_present(frame.body):
                 return False
-            if hit.avatar is None or hit.cloud is None:
-                return False
             left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
             inward = horizontal(hit.cloud - hit.avatar, bodies.up)
-            if not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
+            if norm(left) < _MIN_PUSH or not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
                 return False
-            if not self._runner.push(hit.what, left, frame):
-                return False
-            frame.reports[self._runner.name] = self._runner.report(self._since, frame.budget)
+            pushed = ObjectPush(bodies, row, left, frame).result()
+            if pushed is None or frame.budget.stop:
+                return False  # if stopped, the result may be incomplete
+            bodies.put(row, pushed)
+            frame.reports[self.name] = self._runner.report(self._since, frame.budget)
             return True

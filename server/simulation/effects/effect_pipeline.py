@@ -6,7 +6,7 @@ Files of effects that the scene does not declare are not imported (NUMERICS.md c
 import importlib
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,9 @@ from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
 from ....schemas.wire.stats import EffectStats
 from ...queries.request import EXACT, QueryBudget
-from ...runtime.stop_flag import NO_STOP, StoppedError
+from ...runtime.stop_flag import StoppedError
 from ..world.collision_world import World
-from ..world.frame import MAX_TOUCHED, Body, Frame, Hit, Pose, Runner, Vec
+from ..world.frame import MAX_TOUCHED, Body, Frame, Hit, Pose, Run, Vec
 from ..world.vectors import norm
 
 # The file of each effect.
@@ -29,49 +29,32 @@ _FILES = {
     "slide": "motion_effects", "step": "motion_effects", "ground": "motion_effects",
     "proximity": "report_effects", "contacts": "report_effects", "uncertainty": "uncertainty_effect",
 }  # fmt: skip
-
-
-class EffectTimes:
-    """Frames and seconds by effect. Thread-safe."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        """Begin at 0. names: of the effects, in the order in which they run."""
-        self._counts = {name: [0, 0.0] for name in names}
-        self._lock = threading.Lock()
-
-    def add(self, ran: list[tuple[str, float]]) -> None:
-        """Count a frame. ran: its effects with their times [s]."""
-        with self._lock:
-            for name, seconds in ran:
-                count = self._counts[name]
-                count[0] += 1
-                count[1] += seconds
-
-    def stats(self) -> list[EffectStats]:
-        """Return the counts of each effect, in the order in which they run."""
-        with self._lock:
-            return [EffectStats(name, *count) for name, count in self._counts.items()]  # type: ignore[arg-type]
+# Effects that one call runs, in the order of `Frame.visits`.
+_WALKING = ("sweep", "slide", "step", "ground")
 
 
 class Pipeline:
     """Effects of one scene in their order. Thread-safe, except for two frames of one body.
 
-    groups: the effects in order, in groups that one call runs.  times: what each effect has cost.
-    bodies: `Bodies` that all effects which need them share, and that the simulation updates; None
-    if no effect needs them.
+    world: of the scene.  runs: the effects in order, the names of those that one call runs and the call.
     """
 
-    def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
+    def __init__(self, world: World, runs: Sequence[tuple[Sequence[str], Run]]) -> None:
         """Create a pipeline; callers use `make_pipeline`."""
-        self.file, self.world, self.groups = file, world, _groups_of(runners)
-        self.times = EffectTimes(runner.name for runner in runners)
-        self.bodies: Any = None
-        for runner in runners:
-            if hasattr(runner, "bodies"):
-                self.bodies = self.bodies or runner.bodies
-                runner.bodies = self.bodies
-        self._command_filters: list[Any] = [runner for runner in runners if hasattr(runner, "begin")]
-        self._stops = any(runner.name == "stop" for runner in runners)
+        self.world, self.runs = world, runs
+        self._counts = {name: [0, 0.0] for names, _ in runs for name in names}
+        self._counting = threading.Lock()
+        self._stops = "stop" in self._counts
+
+    @property
+    def bodies(self) -> Any:
+        """Return the `Bodies` of the scene, which the simulation updates; None if no effect needs them."""
+        return self.world.bodies
+
+    def stats(self) -> list[EffectStats]:
+        """Return the frames and seconds of each effect so far, in the order in which they run."""
+        with self._counting:
+            return [EffectStats(name, *count) for name, count in self._counts.items()]  # type: ignore[arg-type]
 
     def run(
         self,
@@ -84,26 +67,20 @@ class Pipeline:
 
         seconds: duration of the frame.
         Raise BadRequestError for a pose farther than limits.longest_move, the errors of queries, or
-        StoppedError. The body is then unchanged.
+        StoppedError. The body is then unchanged; objects that it pushed are not.
         """
         body.pose = np.ascontiguousarray(body.pose, np.float64)
         target = np.array(target, np.float64, order="C")
-        far = norm(target[:3, 3] - body.pose[:3, 3])
-        if not far <= self.file.limits.longest_move:
+        far, longest = norm(target[:3, 3] - body.pose[:3, 3]), self.world.file.limits.longest_move
+        if not far <= longest:
             raise BadRequestError(
-                f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
-                "scene's longest_move: send a nearer pose, or enter the scene there"
+                f"the commanded pose is {far:g} m away: expected within {longest:g} m, the scene's longest_move: "
+                "send a nearer pose, or enter the scene there"
             )
         frame = Frame(body, target, seconds, self.world, budget, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
         self.world.begin(budget.stop)
-        pushed = self._poses_to_restore(body, budget)
-        try:
-            self._simulate(frame)
-        except StoppedError:
-            if pushed is not None:
-                self.bodies.restore(pushed)
-            raise
+        self._simulate(frame)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
         body.effect_state.update(frame.effect_state)
@@ -114,26 +91,24 @@ class Pipeline:
         body, budget, world = frame.body, frame.budget, self.world
         with world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
-            for runner in self._command_filters:
-                runner.begin(frame)
             if not self._stops:
                 frame.pose = frame.target
-            ran: list[tuple[str, float]] = []
+            took: list[tuple[str, float]] = []
             now = time.perf_counter()
-            for group in self.groups:
+            for names, run in self.runs:
                 if budget.stop:
                     raise StoppedError
-                if len(group) > 1:
-                    world.walker.run(frame, sum([each.part for each in group]))  # type: ignore[attr-defined]
-                else:
-                    group[0].run(frame)
-                frame.simulated.extend([each.name for each in group])
+                report = run(frame)
+                if report is not None:
+                    frame.reports[names[0]] = report
+                frame.simulated += names
                 before, now = now, time.perf_counter()
-                if len(group) > 1:
-                    ran.extend(_shared_time(group, now - before, frame.visits))
-                else:
-                    ran.append((group[0].name, now - before))
-            self.times.add(ran)
+                took += _shared_time(names, now - before, frame.visits)
+            with self._counting:
+                for name, seconds in took:
+                    count = self._counts[name]
+                    count[0] += 1
+                    count[1] += seconds
             if not self._stops:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)
             # Bodies that overlap the avatar since the frame's start, such as a placed object, do
@@ -144,34 +119,15 @@ class Pipeline:
                 raise StoppedError
             world.saw(body.user, body.avatar, frame.pose)
 
-    def _poses_to_restore(self, body: Body, budget: QueryBudget) -> Any:
-        """Return the poses of pushed objects that a stopped frame must restore; None if there are none.
 
-        When a frame is stopped depends on a clock, and no pose may depend on a clock.
-        """
-        if budget.stop is NO_STOP or self.bodies is None or not self.bodies.is_present(body):
-            return None
-        return self.bodies.snapshot()
-
-
-def _groups_of(runners: list[Runner]) -> list[list[Runner]]:
-    """Return the effects in groups that one call runs."""
-    groups: list[list[Runner]] = []
-    for runner in runners:
-        if hasattr(runner, "part") and groups and hasattr(groups[-1][-1], "part"):
-            groups[-1].append(runner)
-        else:
-            groups.append([runner])
-    return groups
-
-
-def _shared_time(group: list[Runner], seconds: float, visits: list[int]) -> list[tuple[str, float]]:
-    """Return the time of each effect of a call [s], divided by node visits. visits: of each part."""
-    counts = [visits[runner.part.bit_length() - 1] for runner in group]  # type: ignore[attr-defined]
+def _shared_time(names: Sequence[str], seconds: float, visits: Sequence[int]) -> list[tuple[str, float]]:
+    """Return the time of each effect of a call [s], divided by node visits. visits: by _WALKING."""
+    if len(names) == 1:
+        return [(names[0], seconds)]
+    counts = [visits[_WALKING.index(name)] for name in names]
     total = sum(counts)
-    if not total:
-        return [(runner.name, seconds / len(group)) for runner in group]
-    return [(runner.name, seconds * count / total) for runner, count in zip(group, counts, strict=True)]
+    shares = [count / total for count in counts] if total else [1.0 / len(names)] * len(names)
+    return [(name, seconds * share) for name, share in zip(names, shares, strict=True)]
 
 
 def _vector(place: Vec) -> tuple[float, float, float]:
@@ -210,11 +166,12 @@ def _moved(frame: Frame, unknown: bool) -> Moved:
 
 
 def make_pipeline(file: SceneFile, world: World) -> Pipeline:
-    """Create the pipeline of a scene: import each declared effect and create its runner."""
+    """Create the pipeline of a scene: import the file of each declared effect and create the effect."""
     declared = {effect_name(effect): effect for effect in file.effects}
-    runners: list[Runner] = [
-        importlib.import_module(f".{_FILES[name]}", __package__).make(declared[name], world)
-        for name in ORDER
-        if name in declared
-    ]
-    return Pipeline(file, world, runners)
+    walking = [name for name in _WALKING if name in declared]
+    runs: list[tuple[Sequence[str], Run]] = []
+    for name in ORDER:
+        if name in declared and name not in walking[1:]:
+            make = importlib.import_module(f".{_FILES[name]}", __package__).make
+            runs.append((walking if name in walking else [name], make(declared[name], world)))
+    return Pipeline(world, runs)

@@ -58,57 +58,33 @@ others would otherwise fall.
 
 from typing import Any
 
-import numpy as np
-
-from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep, effect_name
-from ..world.frame import Frame, Vec
+from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep
+from ..world.frame import Frame, Run
 from ..world.frame_walk import FOLLOW, GROUND, SLIDE, STEP, walker_of
 from ..world.vectors import dot, norm
 
 _PARTS: dict[type, int] = {Sweep: FOLLOW, Slide: SLIDE, Step: STEP, Ground: GROUND}
 
 
-class WalkRunner:
-    """Effect that is a part of the kernel `walk_frame`."""
-
-    def __init__(self, name: str, part: int) -> None:
-        self.name, self.part = name, part
-
-    def run(self, frame: Frame) -> None:
-        """Run the part."""
-        frame.world.walker.run(frame, self.part)
+def make(effect: Sweep | Slide | Step | Ground, world: Any) -> Run:
+    """Create all effects of this file that a scene declares: one call of the kernel runs them."""
+    walker = walker_of(world)
+    parts = sum(_PARTS.get(type(each), 0) for each in world.file.effects)
+    return lambda frame: walker.run(frame, parts)
 
 
-class GroundRunner(WalkRunner):
-    """Effect `ground`: stands on the ground or falls (kernels/walk/stand_on_ground.py).
-
-    up: (3,) unit vector.
-    """
-
-    def __init__(self, up: Vec) -> None:
-        super().__init__("ground", GROUND)
-        along = np.flatnonzero(up)
-        self._axis = int(along[0]) if len(along) == 1 else None
-
-    def begin(self, frame: Frame) -> None:
-        """Remove the vertical part of the motion command."""
-        if self._axis is not None:
-            frame.target[self._axis, 3] = frame.body.pose[self._axis, 3]
-            return
-        up, begin = frame.world.up, frame.body.pose[:3, 3]
-        way = frame.target[:3, 3] - begin
-        rises = dot(way, up)
-        if rises == 0.0:
-            return
-        level = way - rises * up
-        if norm(level) <= 1e-12 * abs(rises):  # rounding alone
-            level[:] = 0.0
-        frame.target[:3, 3] = begin + level
-
-
-def make(effect: Sweep | Slide | Step | Ground, world: Any) -> WalkRunner:
-    """Create an effect of a scene."""
-    walker_of(world)
-    if isinstance(effect, Ground):
-        return GroundRunner(world.up)
-    return WalkRunner(effect_name(effect), _PARTS[type(effect)])
+def level_command(frame: Frame) -> None:
+    """Remove the vertical part of the motion command, for `ground`."""
+    up, begin = frame.world.up, frame.body.pose[:3, 3]
+    axes = [axis for axis, part in enumerate(up.tolist()) if part]
+    if len(axes) == 1:
+        frame.target[axes, 3] = begin[axes]
+        return
+    way = frame.target[:3, 3] - begin
+    rises = dot(way, up)
+    if rises == 0.0:
+        return
+    level = way - rises * up
+    if norm(level) <= 1e-12 * abs(rises):  # rounding alone
+        level[:] = 0.0
+    frame.target[:3, 3] = begin + level

@@ -17,11 +17,10 @@ In others the kernel `walk_frame` does, which this file neither imports nor comp
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from ....schemas.scene.effect_table import Contacts, Proximity, Stop, Sweep, Through, Uncertainty
+from ....schemas.scene.effect_table import Contacts, Ground, Proximity, Stop, Sweep, Through, Uncertainty
 from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import make_avatar
@@ -31,6 +30,7 @@ from ..world.frame import (
     Frame,
     Hit,
     Pose,
+    Run,
     Vec,
     find_touched,
     is_clear,
@@ -47,31 +47,46 @@ _ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
 _STILL = (Stop, Proximity, Contacts, Uncertainty, Through)
 
 
+def make(effect: Stop, world: World) -> Run:
+    """Create the effect of a scene."""
+    walks = not all(isinstance(each, _STILL) for each in world.file.effects)
+    return StopRunner(world, effect, walks=walks).run
+
+
 class StopRunner:
     """Effect `stop` of one scene."""
 
-    name = "stop"
+    def __init__(self, world: World, effect: Stop, *, walks: bool) -> None:
+        """Create the effect, and compile what its frames need.
 
-    def __init__(self, world: World, effect: Stop) -> None:
-        """Create the effect, and compile what its frames need."""
-        effects = world.file.effects
+        walks: whether the kernel `walk_frame` follows the motion command.
+        """
         self._skin, self._tolerance = float(effect.skin), float(sweep_tolerance(world.file))
-        self._continuous = any(isinstance(each, Sweep) for each in effects)
-        self._walk: Callable[[Frame], None] | None = None
-        if all(isinstance(each, _STILL) for each in effects):
-            self._warm(world)
+        declared = {type(each) for each in world.file.effects}
+        self._level: Callable[[Frame], None] | None = None
+        self._follow: Callable[[Frame], None] | None = self._follow_alone
+        if walks:
+            from ..world.frame_walk import FOLLOW, walker_of
+
+            walker = walker_of(world)
+            walker.warm()
+            self._follow = None if Sweep in declared else lambda frame: walker.run(frame, FOLLOW)
         else:
-            self._walk = _walk_in(world)
+            self._warm(world)
+        if Ground in declared:
+            from .motion_effects import level_command
+
+            self._level = level_command
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
+        if self._level is not None:
+            self._level(frame)
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)
-        if self._walk is None:
+        if self._follow is not None:
             self._follow(frame)
-        elif not self._continuous:
-            self._walk(frame)
 
     def _warm(self, world: World) -> None:
         """Compile the kernels of a motion that begins in contact."""
@@ -82,7 +97,7 @@ class StopRunner:
             find_first_hit(frame, to, self._tolerance, self._skin)
             settle_before(frame, to, hit, self._skin)
 
-    def _follow(self, frame: Frame) -> None:
+    def _follow_alone(self, frame: Frame) -> None:
         """Move towards the commanded pose; an avatar in contact that cannot do both moves, then turns."""
         hit = self._advance(frame, frame.target)
         if hit is not None and frame.verdict == Verdict.CONTACT:
@@ -114,15 +129,6 @@ class StopRunner:
             hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
         record_hit(frame, hit)
         return hit
-
-
-def _walk_in(world: World) -> Callable[[Frame], None]:
-    """Return the function that follows a motion command by the kernel `walk_frame`, compiled."""
-    from ..world.frame_walk import FOLLOW, walker_of
-
-    walker = walker_of(world)
-    walker.warm()
-    return lambda frame: walker.run(frame, FOLLOW)
 
 
 def escape_contact(frame: Frame) -> None:
@@ -157,8 +163,3 @@ def _escape_displacements(frame: Frame, *, touches: bool) -> list[Vec]:
     if 0.0 < norm(commanded) <= MAX_ESCAPE:
         ways.insert(0, commanded)
     return ways
-
-
-def make(effect: Stop, world: Any) -> StopRunner:
-    """Create the effect of a scene."""
-    return StopRunner(world, effect)

@@ -16,8 +16,7 @@ The model:
 - Scans are independent, so P(contact) = 1 - prod_s Phi(g_s / sigma_s).
 - The avatar has no error.
 
-A scan with g_s > MAX_SIGMAS sigma_s is omitted. Each would add less than OMITTED_PROBABILITY =
-3.2e-5.
+A scan with g_s > MAX_SIGMAS sigma_s is omitted. Each would add less than 3.2e-5.
 
 Phi is computed by math.erfc of the C library, which is accurate to a few units in the last place in
 both tails, where 1 - Phi would cancel. Its last bits may differ between C libraries; on one machine
@@ -26,7 +25,7 @@ the same separations give the same bits. Scans are combined in the order of thei
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -42,9 +41,8 @@ from ...archives.rigid_transform import transform_poses
 from ...avatars.avatar_model import make_avatar
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
 from ...queries.resident_fast_path import distance_fast
-from ...queries.scene_data import SceneData
-from ..world.frame import Frame
-from .report_effects import is_farther_than, nearest
+from ..world.frame import Frame, Run
+from .report_effects import is_farther_than
 
 # Number of standard deviations beyond which a scan is omitted.
 MAX_SIGMAS = 4.0
@@ -55,13 +53,6 @@ MAX_NAMES_LISTED = 8
 # omitted.
 EXACT_UNIT = 1.0 / UNITS_PER_METRE
 
-# Names of a source, shortest first: a later one distinguishes sources that an earlier one does not.
-_NAMES: tuple[Callable[[SourceInfo], str], ...] = (
-    lambda source: PurePath(source.path).name,
-    lambda source: source.path,
-    lambda source: f"{source.path}:{source.index}",
-)
-
 
 def contact_probability(separation: float, sigma: float) -> float:
     """Return Phi(-separation / sigma), the probability of contact with one scan.
@@ -69,10 +60,6 @@ def contact_probability(separation: float, sigma: float) -> float:
     separation: the scan's least signed separation [m].  sigma: > 0 [m].
     """
     return 0.5 * math.erfc(separation / sigma / _SQRT_2)
-
-
-# Largest probability that an omitted scan would add.
-OMITTED_PROBABILITY = contact_probability(MAX_SIGMAS, 1.0)
 
 
 def single_probabilities(separations: Mapping[int, float], sigmas: Mapping[int, float]) -> dict[int, float]:
@@ -99,28 +86,12 @@ def combined_probability(alone: Iterable[float]) -> float:
     return found
 
 
-def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
-    """Return the name of each source in reports, the first of these that is unique.
+def _names_of(source: SourceInfo) -> tuple[str, str, str]:
+    """Return the names of a source: the file's name, the path, and the path with the scan's index in it.
 
-    The candidates are the file's name, the path, and the path with the scan's index in the file.
+    A later one distinguishes sources that an earlier one does not.
     """
-    counts = [Counter(name(source) for source in sources) for name in _NAMES]
-    return [
-        next(
-            (name(s) for name, count in zip(_NAMES, counts, strict=True) if count[name(s)] == 1),
-            _NAMES[-1](s),
-        )
-        for s in sources
-    ]
-
-
-def _sigma_of(effect: Uncertainty, source: SourceInfo) -> float | None:
-    """Return the standard deviation [m] that `Uncertainty.scans` gives a source, or None.
-
-    If several of its names are listed, the longest decides.
-    """
-    own = [effect.scans[name(source)] for name in reversed(_NAMES) if name(source) in effect.scans]
-    return own[0] if own else None
+    return PurePath(source.path).name, source.path, f"{source.path}:{source.index}"
 
 
 def check(effect: Uncertainty, *infos: SceneInfo) -> None:
@@ -128,11 +99,11 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
 
     infos: of the scene's archives.
     """
-    sources = [source for info in infos for source in info.sources if not source.fault]
-    names = {name(source) for source in sources for name in _NAMES}
+    names = [_names_of(source) for info in infos for source in info.sources if not source.fault]
+    known = {name for each in names for name in each}
     for name in effect.scans:
-        if name not in names:
-            listed = sorted({_NAMES[0](source) for source in sources})
+        if name not in known:
+            listed = sorted({file for file, *_ in names})
             more = f", and {len(listed) - MAX_NAMES_LISTED} more" if len(listed) > MAX_NAMES_LISTED else ""
             raise BadRequestError(
                 f"uncertainty: scans: {name!r} is not a scan of {', '.join(info.scene for info in infos)}: expected "
@@ -143,96 +114,65 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
 class ArchiveScans(NamedTuple):
     """Scans of one archive.
 
-    sigmas: [m], by row of `SceneInfo.sources`.  names: of each row, in reports.
-    single_scan: number of the only scan; ANY_SCAN if the archive has several scans with one sigma
-    and does not store the scan of each point; None if it stores the scan of each point.
+    sigmas: [m], by row of `SceneInfo.sources`, and of ANY_SCAN.  names: of each row, in reports: the
+    first one that is unique.
+    only: number of the only scan; ANY_SCAN if the archive has several.
     """
 
     sigmas: dict[int, float]
     names: list[str]
-    single_scan: int | None
+    only: int
 
 
-class WorldScans(NamedTuple):
-    """Scans of each archive of a world, of these generations."""
-
-    generations: tuple[int, ...]
-    scans: list[ArchiveScans]
-
-
-def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> ArchiveScans:
-    """Return the scans of an archive. keeps_scan: whether it stores the scan of each point."""
-    sigmas, live = {ANY_SCAN: effect.sigma}, []
-    for number, source in enumerate(info.sources):
-        if not source.fault:
-            live.append(number)
-            own = _sigma_of(effect, source)
-            sigmas[number] = effect.sigma if own is None else own
-    single_scan = live[0] if len(live) == 1 else None if keeps_scan else ANY_SCAN
-    return ArchiveScans(sigmas, scan_names(info.sources), single_scan)
+def scans_of(effect: Uncertainty, sources: Sequence[SourceInfo]) -> ArchiveScans:
+    """Return the scans of an archive. If `scans` has several names of one, the longest decides."""
+    names = [_names_of(source) for source in sources]
+    counts = Counter(kind_and_name for each in names for kind_and_name in enumerate(each))
+    shown = [
+        next((name for kind, name in enumerate(each) if counts[kind, name] == 1), each[-1]) for each in names
+    ]
+    live = [number for number, source in enumerate(sources) if not source.fault]
+    sigmas = {ANY_SCAN: effect.sigma} | {
+        number: next((effect.scans[n] for n in reversed(names[number]) if n in effect.scans), effect.sigma)
+        for number in live
+    }
+    return ArchiveScans(sigmas, shown, live[0] if len(live) == 1 else ANY_SCAN)
 
 
-def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
-    """Create the effect of a scene. Raises BadRequestError as `check` does."""
-    with world as seen:
-        check(effect, *(each.placed.info() for each in seen))
-        for each in seen:
-            if each.data.keeps_scan:
-                _warm(each.data)
-    return UncertaintyRunner(effect, world)
-
-
-def _warm(data: SceneData) -> None:
-    """Compile the kernel now, and not in the first frame in which something is near."""
+def make(effect: Uncertainty, world: Any) -> Run:
+    """Create the effect of a scene, and compile its kernel before the first frame near something."""
     nowhere = np.eye(4)
     nowhere[:3, 3] = MAX_COORDINATE / 2
-    separation_per_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
+    with world as seen:
+        for each in seen:
+            if each.data.keeps_scan:
+                separation_per_scan(each.data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
+    return UncertaintyRunner(effect).run
 
 
 class UncertaintyRunner:
     """Effect that reports the probability of contact at the frame's pose."""
 
-    name = "uncertainty"
-
-    def __init__(self, effect: Uncertainty, world: Any) -> None:
-        """Create the effect. world: provides the scans, which change with a hot reload."""
+    def __init__(self, effect: Uncertainty) -> None:
+        """Create the effect."""
         self._effect = effect
-        self._margin = MAX_SIGMAS * max(effect.sigma, *effect.scans.values(), 0.0)
-        self._known = self._scans_of(world)
+        self._margin = MAX_SIGMAS * max(effect.sigma, *effect.scans.values(), 0.0) + EXACT_UNIT
+        self._known: tuple[tuple[int, ...], list[ArchiveScans]] = (), []  # of each archive of generations
 
-    def _scans_of(self, world: Any) -> WorldScans:
-        """Return the current scans of each archive."""
-        with world as seen:
-            return WorldScans(
-                world.generations(),
-                [scans_of(self._effect, each.placed.info(), each.data.keeps_scan) for each in seen],
-            )
-
-    def run(self, frame: Frame) -> None:
-        """Search, and write the report."""
-        frame.reports[self.name] = self._report(frame)
-
-    def _report(self, frame: Frame) -> UncertaintyReport:
+    def run(self, frame: Frame) -> UncertaintyReport:
         """Return the report; after an incomplete search, its probability is a lower bound."""
-        answers = nearest(frame, self._margin)
-        if is_farther_than(answers, self._margin):
+        if is_farther_than(frame, self._margin):
             return UncertaintyReport(0.0)
         alone: list[float] = []
         named: dict[str, float] = {}
         exact = True
         with frame.world as seen:
             known = self._known
-            if known.generations != frame.world.generations():
-                known = self._known = self._scans_of(frame.world)
-            for archive, (each, scans) in enumerate(zip(seen, known.scans, strict=True)):
-                if scans.single_scan is not None and len(known.scans) == 1 and answers is not None:
-                    # The nearest pair of all belongs to the only scan.
-                    separations, all_seen = (
-                        {scans.single_scan: float(answers.signed_distance[0])},
-                        bool(answers.exact[0]),
-                    )
-                else:
-                    separations, all_seen = self._separations(frame, each, scans)
+            if known[0] != (generations := frame.world.generations()):
+                found = [scans_of(self._effect, each.placed.info().sources) for each in seen]
+                known = self._known = generations, found
+            for archive, (each, scans) in enumerate(zip(seen, known[1], strict=True)):
+                separations, all_seen = self._separations(frame, each, scans)
                 exact &= all_seen
                 for number, own in single_probabilities(separations, scans.sigmas).items():
                     alone.append(own)
@@ -247,13 +187,13 @@ class UncertaintyRunner:
 
         Also returns whether the search was complete.
         """
-        inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + EXACT_UNIT
+        inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin
         pose = frame.pose if inverse is None else transform_poses(inverse, frame.pose[None])[0]
-        if scans.single_scan is None:
+        if each.data.keeps_scan:
             found = separation_per_scan(each.data, avatar, pose, margin, len(scans.names), frame.budget)
             frame.world.count(found.node_visits, not found.exact)
             return found.separations, found.exact
         answers = distance_fast(each.data, avatar, pose, margin, frame.budget)
         frame.world.count(int(answers.node_visits[0]), not answers.exact[0])
         separation = float(answers.signed_distance[0])
-        return {scans.single_scan: separation} if separation <= margin else {}, bool(answers.exact[0])
+        return {scans.only: separation} if separation <= margin else {}, bool(answers.exact[0])

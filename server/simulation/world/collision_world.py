@@ -67,10 +67,11 @@ class World:
 
     file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
     is_alone: whether it is a single archive at the identity.
-    walker: see `walker_of` in frame_walk.py.
+    walker: see `walker_of` in frame_walk.py.  bodies: see `bodies_of` in body_effects.py.
     """
 
     walker: Any = None
+    bodies: Any = None
 
     def __init__(self, scene: Any, file: SceneFile) -> None:
         """Create the world of a scene, an object with `archives` and `avatar` such as `Scene`."""

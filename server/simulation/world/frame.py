@@ -1,8 +1,9 @@
 """One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,18 +127,9 @@ class Frame:
         return 0 if self.budget.late is None else self.budget.late.count
 
 
-class Runner(Protocol):
-    """One effect of one scene. It stores the state of a user only in `Body`.
-
-    Each effect's module creates one: `make(effect, world)`. If a runner also has a method
-    `begin(frame)`, it is called before any effect runs and may change the motion command. Effects that
-    move the avatar have an attribute `part`, their bit in `walk_frame`: several run in one call.
-    """
-
-    name: str
-
-    def run(self, frame: Frame) -> None:
-        """Run this effect for one frame."""
+# An effect of a scene: runs it for one frame, and returns its report, if it has one. It stores the
+# state of a user only in `Body`. The function `make(effect, world)` of an effect's file returns it.
+Run = Callable[[Frame], Any]
 
 
 def translated(pose: Pose, way: Vec) -> Pose:

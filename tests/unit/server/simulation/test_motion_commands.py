@@ -13,7 +13,6 @@ from solidcloud.server.simulation.simulation import (
     LONGEST_PAUSE,
     first_pose,
     frame_durations,
-    spawn_pose,
     target_pose,
 )
 from solidcloud.server.simulation.world.vectors import rotation_matrix
@@ -80,11 +79,10 @@ def test_frames_last_as_the_clients_clock_says_within_bounds():
 
 def test_users_begin_at_the_spawn_or_where_they_say():
     spawn = Spawn(position=(1.0, 2.0, 3.0), heading=90.0)
-    pose = spawn_pose(spawn, UP)
+    elsewhere = wish(pose_at(9.0, 9.0, 9.0))
+    pose = first_pose(elsewhere, spawn, UP)
     assert np.array_equal(pose[:3, 3], [1.0, 2.0, 3.0])
     assert np.allclose(pose[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    elsewhere = wish(pose_at(9.0, 9.0, 9.0))
-    assert np.array_equal(first_pose(elsewhere, spawn, UP), pose)
     assert np.array_equal(first_pose(wish(velocity=(1.0, 0.0, 0.0)), spawn, UP), pose)
     first = first_pose(elsewhere, None, UP)
     assert np.array_equal(first, elsewhere.pose[0]) and first is not elsewhere.pose[0]

@@ -25,6 +25,8 @@ POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 class Drifting:
     """Stands in for effects whose outcome depends on all frames before it."""
 
+    bodies = None
+
     def __init__(self):
         self.total, self.reloads = 0.0, 0
 

@@ -136,7 +136,6 @@ def test_there_is_room_for_so_many_users_and_who_leaves_makes_room():
     simulation.end(AL)
     simulation.end(AL)
     assert isinstance(simulation.step([FrameCommand(BO, wish(1, 0.5))])[0].state, State)
-    simulation.end_client("a")
     assert simulation.users == [BO]
     simulation.drop_client("b")
     assert simulation.users == [] and simulation.scene.gone == ["b"]

@@ -1,18 +1,22 @@
 """`objects`: doors that are told where to be, crates that are pushed; what they touch, by brute force."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from movable_objects import AVATARS, CRATE, LEAF, MOVING, USER, free_of, item, where
 from moving_bodies import INTERPRETED, at, staged, touch
-from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.errors import BadRequestError, BadTransformError, ExpiredError
 from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.queries.request import EXACT
+from solidcloud.schemas.wire.key_expressions import User
+from solidcloud.schemas.wire.motion_messages import Wish
+from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.runtime.stop_flag import StopFlag as Ending
-from solidcloud.server.runtime.stop_flag import StoppedError
+from solidcloud.server.scene_interface import FrameCommand
+from solidcloud.server.simulation.simulation import Simulation
 from solidcloud.server.simulation.world.bodies import Bodies
 
 
@@ -48,14 +52,21 @@ def test_a_stopped_frame_leaves_what_it_pushed_where_it_stood(
 ) -> None:
     """The frames after it are those of a log's replay, where it is stopped before it begins."""
     after: list[list[Any]] = []
-    put = Bodies.put
+    put, user = Bodies.put, User("c", "u")
     for first in (True, False):
         (tmp_path / str(first)).mkdir()
         objects = (item("crate", at(1.0)), item("other", at(1.65)))
         with staged(tmp_path / str(first), MOVING, avatars=AVATARS, objects=objects) as stage:
-            body, stop, pushed = stage.enter("c/u", USER, at(0)), Ending(), []
-            stage.go("c/u", at(0.1))
-            stood, begun = where(stage, "crate"), body.pose.copy()
+            scene = SimpleNamespace(name="room", avatar=lambda *_: USER)
+            simulation = Simulation(scene, stage.world.file, stage.pipeline)
+            stop, pushed = Ending(), []
+
+            def go(number: int, x: float, stop: Ending = NO_STOP, simulation: Simulation = simulation) -> Any:
+                wish = Wish(seq=number, time=number / 30, pose=at(x)[None])
+                return simulation.step([FrameCommand(user, wish)], stop=stop)[0].state
+
+            go(0, 0.1)
+            stood = where(stage, "crate")
 
             def ended(bodies: Bodies, *what: Any, stop: Ending = stop, pushed: list[int] = pushed) -> None:
                 put(bodies, *what)
@@ -65,12 +76,11 @@ def test_a_stopped_frame_leaves_what_it_pushed_where_it_stood(
             if first:
                 stop.set("ended")
             monkeypatch.setattr(Bodies, "put", ended)
-            with pytest.raises(StoppedError):
-                stage.pipeline.run(body, at(0.9), 1 / 30, EXACT._replace(stop=stop))
+            assert isinstance(go(1, 0.9, stop), ExpiredError)
             monkeypatch.setattr(Bodies, "put", put)
             assert bool(pushed) is not first
-            assert np.array_equal(where(stage, "crate"), stood) and np.array_equal(body.pose, begun)
-            moved = [stage.go("c/u", at(0.1 + 0.1 * i)) for i in range(1, 12)]
+            assert np.array_equal(where(stage, "crate"), stood)
+            moved = [go(1 + i, 0.1 + 0.1 * i) for i in range(1, 12)]
             assert where(stage, "crate")[0, 3] > stood[0, 3]
             after.append(
                 [(each.pose.tolist(), each.verdict, each.objects and each.objects.touching) for each in moved]

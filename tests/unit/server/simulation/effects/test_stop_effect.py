@@ -3,7 +3,6 @@
 import copy
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import archive_cases
 import effect_rooms
@@ -163,11 +162,10 @@ def test_alone_it_moves_like_the_kernel_that_other_effects_need(
             archive.pose, archive.inverse = pose, None if pose is None else np.linalg.inv(pose)
         plays = []
         for alone in (True, False):
-            world = World(SimpleNamespace(archives=archives), game.pipeline.file)
-            plays.append(Play(game.scene, world, make_pipeline(game.pipeline.file, world)))
+            world = World(SimpleNamespace(archives=archives), game.world.file)
+            plays.append(Play(game.scene, world, make_pipeline(game.world.file, world)))
             if not alone:
-                runner: Any = plays[-1].pipeline.groups[0][0]
-                runner._walk = stop_effect._walk_in(world)
+                plays[-1].pipeline.runs = [(["stop"], stop_effect.StopRunner(world, Stop(), walks=True).run)]
         for turn in range(30):
             avatar = (BALL, effect_rooms.person())[turn % 2]
             start = at(*rng.uniform(-0.5, 0.5, 3) * [0.5, 1.0, 1.0], angle=rng.uniform(0, 6))

@@ -122,9 +122,6 @@ def test_deep_inside_it_is_certain_and_far_away_nothing_is_asked(tmp_path: Path)
         assert report(runner, world, body, at(0.0)).probability > 1 - 1e-15
         for height in (0.5, 0.45, 0.4, 0.35):
             assert report(runner, world, body, at(height)) == UncertaintyReport(0.0)
-        asked = world.asked["distance"]
-        assert report(runner, world, body, at(0.345)) == UncertaintyReport(0.0)
-        assert world.asked["distance"] <= asked + 1 and world.asked["contacts"] == 0
 
 
 @pytest.mark.interpreted
@@ -161,7 +158,7 @@ def test_a_name_that_no_scan_has_is_refused_when_the_scene_is_opened(tmp_path: P
         with pytest.raises(
             BadRequestError, match=r"'scan2.ply' is not a scan of scene: expected scan0.ply, scan1.ply"
         ):
-            make(Uncertainty(scans={"scan2.ply": 0.01}), world_of(scene))
+            check(Uncertainty(scans={"scan2.ply": 0.01}), info)
     other = structs.replace(
         info, scene="other", sources=[structs.replace(info.sources[0], path="x/hall.e57")]
     )

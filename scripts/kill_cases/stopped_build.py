@@ -14,6 +14,7 @@ import numpy as np
 import solidcloud.builder
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.index import INDEX_NAME
+from solidcloud.schemas.archive.level import LEVEL_FOLDER
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
 
@@ -173,8 +174,8 @@ class Change(Case):
         """Return the faults of the archive, at any moment."""
         found = content(self.target)
         for whole in (self.old, self.reference):
-            # The preview is replaced later; it states the archive it belongs to.
-            if {name: whole[name] for name in whole if name != PREVIEW_NAME}.items() <= found.items():
+            # Preview and level are replaced later; each states the archive it belongs to.
+            if {name: whole[name] for name in whole if not _is_derived(name)}.items() <= found.items():
                 return self._valid()
         return [f"{self.target}: neither the new archive nor the old: {difference(found, self.reference)}"]
 
@@ -185,6 +186,11 @@ class Change(Case):
     def finished(self) -> list[str]:
         """Return the faults after the scan was added, even by a command stopped during its cleanup."""
         return self.visible() if self.whole() else [f"{self.target}: the scan is not in it"]
+
+
+def _is_derived(name: str) -> bool:
+    """Return whether a file of an archive, by its path there, is of the preview or the level."""
+    return name == PREVIEW_NAME or name.startswith(f"{LEVEL_FOLDER}/")
 
 
 def arguments(scans: Path, target: Path, jobs: int) -> list[str]:

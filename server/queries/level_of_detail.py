@@ -8,7 +8,6 @@ answered from the voxels themselves.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,46 +26,38 @@ from .resolve import drop_entries
 from .scene_data import LevelOfDetail, SceneData, make_scene_data, with_stop
 
 
-class LevelData(NamedTuple):
-    """Opened level, before a radius model is chosen.
-
-    data: of its archive.  occurs: (32,) bool, cover classes that a representative has.
-    settles_exact, parents: see `LevelOfDetail`.
-    """
-
-    data: SceneData
-    occurs: NDArray[np.bool_]
-    settles_exact: bool
-    parents: NDArray[np.int64]
-
-
 def open_level_data(
     archive: Archive, residency: VoxelCache, described: Archive, *, settles_exact: bool
-) -> LevelData:
-    """Return the data of a level whose voxels `residency` holds. described: the archive of the level."""
+) -> LevelOfDetail:
+    """Return a level whose voxels `residency` holds, for a scene of points without radius.
+
+    described: the archive of the level.
+    """
     halvings = halvings_between(archive.header.lattice, described.header.lattice)
     keys = voxel_keys(archive.coordinates >> halvings)
     parents = np.searchsorted(described.voxels["key"], keys)
-    occurs = archive.header.radius_counts > 0
-    return LevelData(make_scene_data(archive, residency), occurs, settles_exact, parents)
+    data, units = make_scene_data(archive, residency), cover_units()
+    points = data._replace(radius_units=0)
+    # Only classes that occur count.
+    largest = int(units[archive.header.radius_counts > 0].max())
+    arrays = data.arrays._replace(radius_deficit=np.maximum(largest - units, 0))
+    covers = data._replace(arrays=arrays, radius_units=largest)
+    return LevelOfDetail(covers, points, settles_exact, parents)
 
 
-def with_level(data: SceneData, level: LevelData | None) -> SceneData:
-    """Return the same scene with a level whose spheres are made for the scene's radii."""
+def with_level(data: SceneData, level: LevelOfDetail | None) -> SceneData:
+    """Return the same scene with a level whose spheres are larger by those of the scene.
+
+    level: by `open_level_data`.
+    """
     if level is None:
         return data
     largest = data.radius_units
     smallest = largest - int(data.arrays.radius_deficit.max())
-    radii = largest + cover_units()
-    top = int(radii[level.occurs].max())
-    own = level.data.arrays
-    covers = level.data._replace(
-        arrays=own._replace(radius_deficit=np.maximum(top - radii, 0)), radius_units=top
+    covers = level.covers._replace(radius_units=level.covers.radius_units + largest)
+    return data._replace(
+        level=level._replace(covers=covers, points=level.points._replace(radius_units=smallest))
     )
-    points = level.data._replace(
-        arrays=own._replace(radius_deficit=np.zeros(1, np.int64)), radius_units=smallest
-    )
-    return data._replace(level=LevelOfDetail(covers, points, level.settles_exact, level.parents))
 
 
 def find_level(data: SceneData, budget: QueryBudget) -> LevelOfDetail | None:

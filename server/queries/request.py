@@ -302,7 +302,7 @@ def check_request(
             )
 
 
-def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
+def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: float) -> Iterator[list[int]]:
     """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
     part: list[int] = []
     taken = 0

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from .request import CostCounter, QueryBudget
+from .request import CostCounter, QueryBudget, parts_that_fit
 from .scene_data import SceneData
 
 _A = TypeVar("_A")
@@ -84,14 +84,12 @@ def resolve(
     budget was spent or the request was stopped; inf for items that are finished.
     """
     absent = data.arrays.where[lists.rows[: lists.starts[-1]], 0] < 0
-    if settle is None or not absent.any():
-        return (yield from load_and_search(data, lists, search, budget, spent, together=together))
-    if together and not budget.stop:
+    if settle is not None and absent.any() and together and not budget.stop:
         cold = yield from settle(drop_entries(lists, ~absent))
         settled = np.diff(cold.starts) == 0
         lists = drop_entries(lists, absent & settled[items_of(lists)])
-    if together:
-        return (yield from load_and_search(data, lists, search, budget, spent, together=True))
+    if settle is None or not absent.any() or together:
+        return (yield from load_and_search(data, lists, search, budget, spent, together=together))
     left = yield from load_and_search(data, drop_entries(lists, absent), search, budget, spent)
     lists = drop_entries(lists, ~absent)
     if not budget.stop:  # all that is resident has been searched
@@ -193,8 +191,7 @@ def _that_fit(data: SceneData, rows: NDArray[np.int64], share: float = SHARE) ->
     capacity = share * residency.buffer.total_bytes
     if residency.bytes_of(rows.tolist()) <= capacity:
         return rows
-    taken = np.cumsum([residency.bytes_of([row]) for row in rows.tolist()])
-    return rows[: max(1, int(np.searchsorted(taken, capacity, side="right")))]
+    return np.array(next(parts_that_fit(residency, rows.tolist(), capacity)))
 
 
 def items_of(lists: VoxelLists) -> NDArray[np.int64]:

@@ -121,6 +121,13 @@ def test_who_turns_wants_what_is_ahead_of_it_now() -> None:
     assert not any(x >= 3 for x, _ in wanted), "where it was heading a moment ago is wanted no more"
 
 
+def test_the_second_pose_tells_the_velocity() -> None:
+    around = make(NO_RING)
+    walk(around, straight(3.0, 2))
+    (track,) = around._users.values()
+    assert np.allclose(track.velocity, [3.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize("apart", [0.0, 0.001, 0.01, 0.1])
 def test_the_velocity_does_not_depend_on_the_intervals_of_poses(apart: float) -> None:
     """Of two users at one speed, the poses of one arrive in pairs."""

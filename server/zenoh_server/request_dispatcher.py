@@ -255,7 +255,7 @@ class RequestDispatcher:
             return structs.replace(scene.info(), compiling=self.warming.compiling)
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
-        if not self.warming.complete:
+        if self.warming.left:
             asked_for = request.op if isinstance(request, PathRequest) else route.operation
             self.warming.check(needed_part(asked_for))
         return operation.ask(scene, request, route.client, stop)
@@ -263,7 +263,7 @@ class RequestDispatcher:
     def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:
         """Reload one scene when the answer is requested; log and raise errors."""
         try:
-            if not self.warming.complete:
+            if self.warming.left:
                 raise BusyError("reload not ready: this server is still warming: ask again in some seconds")
             answer = scene.reload()
         except Exception as error:

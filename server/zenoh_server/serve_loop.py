@@ -116,7 +116,7 @@ def _reloader(dispatcher: RequestDispatcher) -> Iterator[threading.Event]:
         while wanted.wait() and not ended.is_set():
             wanted.clear()
             # A reload warms too; closing its scene would wait until it has compiled everything.
-            while not (dispatcher.warming.complete or ended.wait(_LOOK_SECONDS)):
+            while dispatcher.warming.left and not ended.wait(_LOOK_SECONDS):
                 pass
             if not ended.is_set():
                 dispatcher.reload()

@@ -23,24 +23,25 @@ class Warming:
     """Warming of the scenes of a server. Thread-safe. Until it begins, nothing is refused.
 
     scenes: none is warm.  compiles: returns whether this process compiles kernels.
+    left: parts that are not warm, the next one first.
     """
 
     def __init__(self, scenes: Sequence[ServedScene], compiles: Callable[[], bool] = has_compiled) -> None:
         self._scenes, self._compiles = scenes, compiles
         self._lock = threading.Lock()
-        self._left: list[str] = []  # the next part first
+        self.left: list[str] = []
         self._ended = False
 
     def run(self) -> None:
         """Warm everything. Raise SolidcloudError if a scene cannot be read."""
         self.run_first()
-        while self._left:
-            self._warm(self._left[0])
+        while self.left:
+            self._warm(self.left[0])
 
     def run_first(self) -> None:
         """Warm what is needed before the first request. Raise SolidcloudError as `run`."""
         start_deadlines()
-        self._left = list(PARTS)
+        self.left = list(PARTS)
         for scene in self._scenes:
             log.info("warming %s", scene.name)
         self._warm(PARTS[0])
@@ -50,40 +51,35 @@ class Warming:
 
         Errors are logged; requests will meet them again.
         """
-        while self._left and not self._ended:
-            part = self._left[0]
+        while self.left and not self._ended:
+            part = self.left[0]
             try:
                 self._warm(part)
             except Exception:
                 log.exception("cannot warm %s", part)
                 self._done(part)
-        return self.complete
+        return not self.left
 
     def end(self) -> None:
         """End `run_rest` after the part in work."""
         self._ended = True
 
     @property
-    def complete(self) -> bool:
-        """Return whether no part is left."""
-        return not self._left
-
-    @property
     def compiling(self) -> list[str]:
         """Return the parts that `check` refuses, the next one first."""
-        return list(self._left) if self._compiles() else []
+        return list(self.left) if self._compiles() else []
 
     def check(self, *parts: str) -> None:
         """Raise BusyError if a part is not ready, and let it be the next one."""
-        if self.complete or not self._compiles():
+        if not self.left or not self._compiles():
             return
         with self._lock:
-            missing = [part for part in parts if part in self._left]
+            missing = [part for part in parts if part in self.left]
             if not missing:
                 return
-            now, *later = self._left
-            self._left = list(dict.fromkeys([now, *missing, *later]))
-            count = len(self._left)
+            now, *later = self.left
+            self.left = list(dict.fromkeys([now, *missing, *later]))
+            count = len(self.left)
         raise BusyError(
             f"{' and '.join(missing)} not ready: this server compiles its kernels, once on this computer; "
             f"{count} of {len(PARTS)} parts are left: ask again in some seconds"
@@ -96,4 +92,4 @@ class Warming:
 
     def _done(self, part: str) -> None:
         with self._lock:
-            self._left = [other for other in self._left if other != part]
+            self.left = [other for other in self.left if other != part]

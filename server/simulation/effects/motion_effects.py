@@ -56,6 +56,7 @@ top is above the middle of the avatar stands beside it and is no ground: a user 
 others would otherwise fall.
 """
 
+from functools import partial
 from typing import Any
 
 from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep
@@ -68,9 +69,8 @@ _PARTS: dict[type, int] = {Sweep: FOLLOW, Slide: SLIDE, Step: STEP, Ground: GROU
 
 def make(effect: Sweep | Slide | Step | Ground, world: Any) -> Run:
     """Create all effects of this file that a scene declares: one call of the kernel runs them."""
-    walker = walker_of(world)
     parts = sum(_PARTS.get(type(each), 0) for each in world.file.effects)
-    return lambda frame: walker.run(frame, parts)
+    return partial(walker_of(world).run, parts=parts)
 
 
 def level_command(frame: Frame) -> None:

@@ -17,6 +17,7 @@ In others the kernel `walk_frame` does, which this file neither imports nor comp
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -70,7 +71,7 @@ class StopRunner:
 
             walker = walker_of(world)
             walker.warm()
-            self._follow = None if Sweep in declared else lambda frame: walker.run(frame, FOLLOW)
+            self._follow = None if Sweep in declared else partial(walker.run, parts=FOLLOW)
         else:
             self._warm(world)
         if Ground in declared:

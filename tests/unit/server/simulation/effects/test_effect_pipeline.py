@@ -86,10 +86,10 @@ def test_a_frame_that_fails_leaves_the_body_as_it_was(
         with pytest.raises(BadTransformError):
             game.pipeline.run(body, sheared)
 
-        def fails(frame: Any, parts: int) -> None:
+        def fails(frame: Any) -> None:
             raise RuntimeError("of the last effect")
 
-        monkeypatch.setattr(game.world.walker, "run", fails)
+        monkeypatch.setattr(game.pipeline, "runs", [*game.pipeline.runs[:-1], (["ground"], fails)])
         with pytest.raises(RuntimeError):
             game.go(body, (0.1, 0, 0))
         assert (body.pose.tobytes(), body.fall_speed, body.on_ground, body.clear) == before

@@ -55,7 +55,8 @@ def test_what_moved_is_said_once_a_frame_is_done_and_not_lost_with_one_that_fail
         there = at(0, 1.5).tolist()
         stage.bodies.place_objects({"door": there})
         with monkeypatch.context() as broken, pytest.raises(OSError, match="disk"):
-            broken.setattr(stage.world.walker, "run", lambda *_: (_ for _ in ()).throw(OSError("disk")))
+            fails = (["sweep"], lambda frame: (_ for _ in ()).throw(OSError("disk")))
+            broken.setattr(stage.pipeline, "runs", [*stage.pipeline.runs[:-1], fails])
             stage.go("c/u", at(0.1, -1))
         assert np.array_equal(body.pose, at(0, -1))
         for expected in ({"door": there}, {}):

@@ -24,11 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..kernels.collide.collide_poses import collide_resident
-from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN
+from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
-from ..kernels.motion.motion_scratch import make_scratch
-from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
+from ..kernels.motion.sweep_resident import make_scratch, pose_between, sweep_resident
+from ..kernels.motion.sweep_segments import avatar_box
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
 from ..residency.voxel_cache import VoxelCache
@@ -198,7 +198,7 @@ class ResidentQueries:
         self.avatar = avatar
         self.body = Held(refer_to_avatar(avatar.arrays))
         self._small = 0 < len(avatar.points) <= MAX_FAST_POINTS
-        self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
+        self._box = avatar_box(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
         self._scratch = make_scratch(avatar.arrays) if self._small else None
         self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
         self._result = np.empty(_swept.COLUMNS)

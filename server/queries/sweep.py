@@ -13,8 +13,8 @@ from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import check_poses
-from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
+from ..kernels.motion.sweep_resident import make_scratch
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
     avatar_box,

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RADIUS_CLASSES
-from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.placed_avatar import Avatar, largest_term, place
@@ -110,8 +109,7 @@ class AvatarChord(NamedTuple):
     final: bool
 
 
-@nb.njit(nogil=True, cache=True)
-def make_moving(avatar):
+def make_moving(avatar: Avatar) -> MovingAvatar:
     """Allocate scratch for one avatar, not empty. It may serve any number of motions, one at a time."""
     nodes, blocks = avatar.center.shape[0], avatar.points.shape[0]
     return MovingAvatar(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import largest_term, place
+from ..core.placed_avatar import Avatar, largest_term, place
 from ..core.reach import INFINITE, REACH_STACK, entry_fraction, list_item
 from ..core.scene_arrays import stopped
 from .screw_motion import make_motion, pose_at
@@ -56,24 +56,14 @@ class PlanSpace(NamedTuple):
     stack: NDArray[np.int64]
 
 
-@nb.njit(nogil=True, cache=True)
-def make_plan_space():
+def make_plan_space() -> PlanSpace:
     """Allocate a `PlanSpace`."""
     return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty(REACH_STACK, np.int64))
 
 
-@nb.njit(nogil=True, cache=True)
-def avatar_box(avatar):
+def avatar_box(avatar: Avatar) -> NDArray[np.float64]:
     """Return the least and greatest coordinates (2, 3) of an avatar's points, not empty [m]."""
-    box = np.empty((2, 3))
-    for r in range(3):
-        least, most = avatar.points[0, r, 0], avatar.points[0, r, 0]
-        for block in range(avatar.points.shape[0]):
-            for j in range(avatar.points.shape[2]):
-                least = min(least, avatar.points[block, r, j])
-                most = max(most, avatar.points[block, r, j])
-        box[0, r], box[1, r] = least, most
-    return box
+    return np.stack([avatar.points.min(axis=(0, 2)), avatar.points.max(axis=(0, 2))])
 
 
 @njit_no_refcount
@@ -165,7 +155,7 @@ def plan_segments(box, first, last, avatar, units, scene, tree, which, progress,
             span = place_root_sphere(motion, t, avatar, units[i], scene, pose, shift, begin)
             span = max(span, place_root_sphere(motion, stop, avatar, units[i], scene, pose, shift, end))
             span += sagitta_of(motion, stop - t, scene)
-            if entry_fraction(begin, end, span, tree.scene[:1], tree.scene[1:], 0) < INFINITE:
+            if entry_fraction(begin, end, span, tree.scene) < INFINITE:
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue
@@ -221,6 +211,6 @@ def find_unknown_regions(box, first, last, avatar, units, scene, tree, until, ou
                 outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]
                 outside[i] |= max(begin[r], end[r]) + span > tree.scene[1, r]
             for u in range(tree.unknown.shape[0]):
-                met = entry_fraction(begin, end, span, tree.unknown[:, 0], tree.unknown[:, 1], u)
+                met = entry_fraction(begin, end, span, tree.unknown[u])
                 if met < INFINITE:
                     unknown_from[i] = min(unknown_from[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference
-from ..motion.motion_scratch import MotionScratch
-from ..motion.sweep_resident import COLUMNS
+from ..motion.sweep_resident import COLUMNS, MotionScratch
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -219,7 +218,7 @@ def make_settings(
 
 @nb.njit(nogil=True, cache=True)
 def make_walk_avatar(body, rows, surface, scratch, box, points, radius):
-    """Return the arrays of an avatar. body: reference.  scratch: of motions.  box: `box_of` it.
+    """Return the arrays of an avatar. body: reference.  scratch: of motions.  box: `avatar_box` of it.
 
     rows, surface: see `lowest_heights`.
     points: (n, 3) float64, avatar frame [m].  radius: of its spheres [m].

@@ -13,7 +13,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
-from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
+from ...kernels.motion.sweep_resident import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
 from ...queries.context.query_budget import QueryBudget
 from ...queries.context.query_context import parts_that_fit
 from .collision_world import HeldArchive, to_archive, to_world

@@ -4,6 +4,7 @@ Results come in the order of the units. A progress listener learns how much is d
 line draws it.
 """
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -20,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.kernels import compile_progress
 from ...schemas.process.interrupts import blocking_sigint, check_interrupt
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 Handle = TypeVar("Handle")
 
+_COMPILING = logging.getLogger("solidcloud.schemas.kernels.compiling")
 # With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
 # saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
@@ -177,7 +178,7 @@ def _begin_worker(compile_messages: int) -> None:
     End this worker if the builder is killed.
     compile_messages: level of messages on compilation in the builder, which may print its own.
     """
-    compile_progress.log.setLevel(compile_messages)
+    _COMPILING.setLevel(compile_messages)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since the process started
     threading.Thread(target=_end_with_builder, daemon=True).start()
@@ -204,7 +205,7 @@ class ProcessExecutor:
         # Spawn, not fork: a fork copies locks that other threads hold, such as those of a progress
         # bar.
         context = multiprocessing.get_context("spawn")
-        level = (compile_progress.log.level,)
+        level = (_COMPILING.level,)
         self._pool = (
             ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=level)
             if jobs > 1

@@ -19,7 +19,6 @@ import zstandard
 from numpy.typing import NDArray
 
 from ..errors import BadRequestError, CorruptError
-from ..kernels.record_rows import join_planes
 
 # The low bytes are nearly random and do not compress; the high bytes repeat over long runs. Fewer
 # and longer matches than those of level 3 decode the paper's voxel 0.6 ms faster, and save 2 % of
@@ -185,8 +184,10 @@ def column_of(planes: NDArray[np.uint8], dtype: np.dtype, field: str) -> NDArray
     """
     kind, at = dtype.fields[field][:2]  # type: ignore[index]  # compound, all of them
     n, size = planes.shape[1], kind.base.itemsize
-    words = np.empty((kind.itemsize // size, n), f"u{size}")
-    join_planes(planes[at : at + kind.itemsize], words)
+    parts = planes[at : at + kind.itemsize].reshape(-1, size, n)  # HDF5's shuffle, low bytes first
+    words = parts[:, 0].astype(f"u{size}")
+    for b in range(1, size):
+        words |= np.left_shift(parts[:, b], 8 * b, dtype=words.dtype)
     return words.view(kind.base).reshape(*kind.shape, n)
 
 

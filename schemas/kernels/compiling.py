@@ -14,6 +14,9 @@ the machine takes part, so that compiled code can be delivered (scripts/build_wh
 import functools
 import hashlib
 import importlib.machinery
+import logging
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +28,6 @@ from numba.core import types
 from numba.experimental import structref
 from numba.extending import intrinsic, overload
 
-from .compile_progress import CompileProgress
 from .kernel_dispatcher import Kernel, config
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
@@ -61,7 +63,9 @@ _SETTINGS = (
 _DELIVERED = Path(__file__).parent / "compiled"
 # A file name holds 255 bytes; the digest takes 64.
 _MAX_LABEL = 150
-_progress = CompileProgress()
+# A program that compiles for longer than this is told so [s].
+_SILENT = 1.0
+log = logging.getLogger(__name__)
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -92,12 +96,12 @@ def entry_point(kernel: Any, *arguments: Any) -> Any:
 
 def on_first_compilation(call: Callable[[], object] | None) -> None:
     """Set what is called once before this process compiles its next function; None for nothing."""
-    _progress.on_first = call
+    _store.on_first = call
 
 
 def has_compiled() -> bool:
     """Return whether no file held some function, so that this or another process compiles it."""
-    return _progress.any or kernel_files().has_waited
+    return _store.begun > 0.0 or kernel_files().has_waited
 
 
 @functools.cache
@@ -107,40 +111,59 @@ def kernel_files() -> KernelFiles:
 
 
 class _KernelStore:
-    """The store of compiled code, for kernel_dispatcher.py."""
+    """The store of compiled code, for kernel_dispatcher.py, which calls it one thread at a time.
 
-    def name(self, function: Callable[..., Any], inner: bool, sig: Any, target: tuple[str, ...]) -> str:
+    on_first: called once, before a compilation begins.  begun: when the first one began; 0: none has.
+    """
+
+    def __init__(self) -> None:
+        self.on_first: Callable[[], object] | None = None
+        self.begun = 0.0
+        self._is_told = False
+
+    def name(self, function: Callable[..., Any], sig: Any, target: tuple[str, ...]) -> str:
         """Return the file name of a function's code for a signature and a family of processors."""
         module, qualname = function.__module__, function.__qualname__
-        decides = (
-            inner,
-            _settings(),
-            source_digest(module).hex(),
-            module,
-            qualname,
-            function.__code__.co_firstlineno,
-            target,
-            sig,
-        )
+        line = function.__code__.co_firstlineno
+        decides = (_settings(), source_digest(module).hex(), module, qualname, line, target, sig)
         digest = hashlib.sha256(repr(decides).encode()).hexdigest()
-        label = f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + ".inner" * inner
-        return label + f"-{digest}.kernel"
+        label = f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL]
+        return f"{label}-{digest}.kernel"
 
     def read(self, name: str) -> bytes | None:
         """Return what is stored; None if it is to be compiled."""
         payload = kernel_files().read(name)
         if payload is None:
-            _progress.begin()
+            self._begin()
         return payload
 
     def write(self, name: str, payload: bytes) -> None:
         """Store compiled code."""
-        _progress.end()
         kernel_files().write(name, payload)
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove code that cannot be used; an empty fault is not reported."""
+        """Remove code that cannot be used."""
         kernel_files().discard(name, fault)
+
+    def _begin(self) -> None:
+        """Record that a compilation begins, and log it once unless it is over soon.
+
+        The message is a warning if somebody watches the standard error stream, otherwise information,
+        so that a program's output does not change. The commands print lines of their own
+        (server/cli/output/compile_notice.py).
+        """
+        first, self.on_first = self.on_first, None
+        if first is not None:
+            first()
+        now = time.monotonic()
+        self.begun = self.begun or now
+        if now > self.begun + _SILENT and not self._is_told:
+            self._is_told = True
+            watched = "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty())
+            log.log(
+                logging.WARNING if watched else logging.INFO,
+                "compiling for this computer, which is done once and takes up to a minute",
+            )
 
 
 _store = _KernelStore()

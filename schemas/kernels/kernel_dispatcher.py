@@ -4,7 +4,8 @@ numba compiles every function for both uses at once: for Python with two wrapper
 for other compiled functions as LLVM code that is linked into them. Most kernels have one of these
 uses. `Kernel` compiles for a use when it is first needed. The code for other kernels (`inner`) is
 neither linked with what it calls nor optimised as a whole nor translated to machine code: that is
-done once, in the unit of the kernel that Python calls. Of that unit only machine code is stored.
+done once, in the unit of the kernel that Python calls. Of that unit only machine code is stored;
+inner kernels are not stored.
 
 This is the only module that uses parts of numba that are not documented and may change with its next
 version: see pyproject.toml. They are:
@@ -15,7 +16,9 @@ version: see pyproject.toml. They are:
 - `JITCodeLibrary`: `_linking_libraries`, `_final_module`, `_shared_module`, `_reload_init` and the
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
-- `Flags.values`, which is replaced by a faster one;
+- `PassManager.passes`, from which `_Pipeline` takes some away;
+- `Flags.values`, which is replaced by a faster one, and the callbacks of llvmlite's lock, which are
+  removed; the options of functions of numba's own library (`jit_registry`);
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
@@ -34,7 +37,10 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
+from numba.core.target_extension import cpu_target, jit_registry
+from numba.core.typed_passes import NopythonRewrites
 from numba.core.types import unliteral
+from numba.core.untyped_passes import InlineClosureLikes
 
 # numba creates their attributes on import, invisible to type checkers.
 config: Any = numba_config
@@ -51,6 +57,7 @@ _V3 = ("avx2", "bmi", "bmi2", "cx16", "f16c", "fma", "lzcnt", "movbe", "popcnt",
 _V4 = (*_V3, "avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl")
 _FAMILIES = {("x86-64-v4", "-prefer-256-bit"): _V4, ("x86-64-v3", ""): _V3}
 
+_SKIPPED = (InlineClosureLikes, NopythonRewrites)
 _DEFAULTS: dict[str, Any] = compiler.Flags().values()
 
 
@@ -62,6 +69,25 @@ def _values(self: Any) -> dict[str, Any]:
 # The same values as numba's, in a tenth of the time. numba compares them whenever it types an
 # operation, 140,000 times before the first answer of `collide`: 5 s of 38.
 compiler.Flags.values = _values
+
+
+# numba measures the time in LLVM by two events a call, 110,000 before the first answer of `collide`, each
+# sent to all functions in work. Nobody reads it.
+llvm.ffi.lib._lock._cblist.clear()
+
+# Functions of numba's own library that a kernel calls are compiled without a wrapper for C, which nobody
+# calls.
+jit_registry[cpu_target] = functools.partial(jit_registry.pop(cpu_target), no_cfunc_wrapper=True)
+
+
+class _Pipeline(compiler.CompilerBase):  # type: ignore[misc]
+    """numba's passes but for those of closures and of array expressions, which no kernel has."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return the only pipeline."""
+        pipeline = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state)
+        pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED]
+        return [pipeline]
 
 
 class _Codegen(JITCPUCodegen):  # type: ignore[misc]
@@ -101,7 +127,7 @@ def _codegen() -> _Codegen:
 class Store(Protocol):
     """Place of compiled code; every method takes the name of the code."""
 
-    def name(self, function: Callable[..., Any], inner: bool, sig: Any, target: tuple[str, ...]) -> str:
+    def name(self, function: Callable[..., Any], sig: Any, target: tuple[str, ...]) -> str:
         """Return the name of a function's code for a signature and a target."""
 
     def read(self, name: str) -> bytes | None:
@@ -111,15 +137,7 @@ class Store(Protocol):
         """Store compiled code."""
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove code that cannot be used; an empty fault is not reported."""
-
-
-class _StaleError(Exception):
-    """Code that calls code which has been compiled again since."""
-
-
-# Kernels by module and name, for stored code to find what it calls.
-_kernels: dict[tuple[str, str], "Kernel"] = {}
+        """Remove code that cannot be used."""
 
 
 class Kernel(_Dispatcher):  # type: ignore[misc]
@@ -129,17 +147,15 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
     """
 
     def __init__(self, function: Any, options: dict[str, Any], store: Store | None) -> None:
-        super().__init__(function, targetoptions=options)
+        super().__init__(function, targetoptions=options, pipeline_class=_Pipeline)
         self._compiler.__class__ = _KernelCompiler
-        self._store = store
         if store is not None:
-            self._cache = _StoredCode(function, store, inner=False)
-            _kernels[function.__module__, function.__qualname__] = self
+            self._cache = _StoredCode(function, store)
 
     @functools.cached_property
     def inner(self) -> "InnerKernel":
         """Return the function for calls from other kernels."""
-        return InnerKernel(self.py_func, self.targetoptions, self._store)
+        return InnerKernel(self.py_func, self.targetoptions)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call from another kernel."""
@@ -156,11 +172,9 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
 class InnerKernel(_Dispatcher):  # type: ignore[misc]
     """Function that only other kernels can call. Parameters as `Kernel`."""
 
-    def __init__(self, function: Any, options: dict[str, Any], store: Store | None) -> None:
-        super().__init__(function, targetoptions=options)
+    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=_Pipeline)
         self._compiler.__class__ = _InnerCompiler
-        if store is not None:
-            self._cache = _StoredCode(function, store, inner=True)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.
@@ -216,10 +230,6 @@ class _InnerCompiler(_KernelCompiler):
         flags = compiler.Flags()
         flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.no_compile = True
         compiled = self._compile(args, return_type, flags, _InnerLibrary)._replace(entry_point=_InnerKey())
-        compiled.library.key = (
-            self.py_func.__module__, self.py_func.__qualname__, compiled.signature.args,
-            compiled.fndesc.llvm_func_name,
-        )  # fmt: skip
         self.targetdescr.target_context.insert_user_function(
             compiled.entry_point, compiled.fndesc, [compiled.library]
         )
@@ -233,11 +243,8 @@ class _InnerKey:
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code of a function and of numba's functions that it calls.
 
-    callees: the inner kernels that it calls.  key: module and name of its kernel, types of its
-    arguments, name of its LLVM function.
+    callees: the inner kernels that it calls.
     """
-
-    key: tuple[str, str, Any, str]
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
@@ -311,15 +318,12 @@ class _KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _StoredCode(_Cache):  # type: ignore[misc]
-    """Stored code of one function, with numba's cache interface.
-
-    inner: for calls from other kernels, not from Python.
-    """
+    """Stored code of one kernel, with numba's cache interface."""
 
     cache_path = ""
 
-    def __init__(self, function: Callable[..., Any], store: Store, *, inner: bool) -> None:
-        self._function, self._store, self._inner = function, store, inner
+    def __init__(self, function: Callable[..., Any], store: Store) -> None:
+        self._function, self._store = function, store
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code for a signature; None if nothing usable is stored."""
@@ -331,9 +335,7 @@ class _StoredCode(_Cache):  # type: ignore[misc]
             stored, parts = pickle.loads(payload)
             if stored != sig:
                 raise ValueError(f"it is for {stored}, expected {sig}")
-            return (_rebuild_inner if self._inner else _rebuild)(target_context, *parts)
-        except _StaleError:
-            self._store.discard(name, "")
+            return _rebuild(target_context, *parts)
         except Exception as error:
             self._store.discard(name, f"{type(error).__name__}: {error}")
         return None
@@ -343,19 +345,15 @@ class _StoredCode(_Cache):  # type: ignore[misc]
         if data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
             return
         data.fndesc.typemap = data.fndesc.calltypes = None  # cannot be stored, nobody reads them
-        library = data.library
-        if self._inner:
-            code = library.own_module().as_bitcode(), library.key, [each.key for each in library.callees]
-        else:
-            code = library._get_compiled_object()
         environments = tuple(data._find_referenced_environments())
         parts = (
-            library.name, code, data.fndesc, data.environment, data.signature, data.reload_init, environments,
+            data.library.name, data.library._get_compiled_object(), data.fndesc, data.environment,
+            data.signature, data.reload_init, environments,
         )  # fmt: skip
         self._store.write(self._name(sig), dumps((sig, parts)))
 
     def _name(self, sig: Any) -> str:
-        return self._store.name(self._function, self._inner, sig, _codegen().magic_tuple())
+        return self._store.name(self._function, sig, _codegen().magic_tuple())
 
     def enable(self) -> None:
         """Do nothing: stored code is always used."""
@@ -379,56 +377,17 @@ def _rebuild(
     entry_point = target.get_executable(library, fndesc, env)
     for environment in environments:
         library.codegen.set_env(environment.env_name, environment)
-    return _result(target, library, fndesc, env, sig, reload_init, environments, entry_point)
-
-
-def _rebuild_inner(
-    target: Any, name: str, code: Any, fndesc: Any, env: Any, sig: Any, reload_init: Any, environments: Any
-) -> Any:
-    """Return an inner kernel's code from the parts that `save_overload` stored.
-
-    Raises _StaleError if what it calls has been compiled again since.
-    """
-    for initialise in reload_init:
-        initialise()
-    library = _InnerLibrary(_codegen(), name)
-    bitcode, library.key, callees = code
-    for key in callees:
-        module, qualname, args, _ = key
-        inner = _kernels[module, qualname].inner
-        inner.compile(args)
-        callee = inner.overloads[args].library
-        if callee.key != key:
-            raise _StaleError
-        library.callees.append(callee)
-    library._final_module = library._shared_module = llvm.parse_bitcode(bitcode)
-    library._finalize_dynamic_globals()
-    library._finalized = True
-    return _result(target, library, fndesc, env, sig, reload_init, environments, _InnerKey())
-
-
-def _result(
-    target: Any,
-    library: Any,
-    fndesc: Any,
-    environment: Any,
-    signature: Any,
-    reload_init: Any,
-    referenced_envs: Any,
-    entry_point: Any,
-) -> Any:
-    """Return numba's record of a compiled function."""
     return compiler.compile_result(
         typing_context=target.typing_context,
         target_context=target,
         entry_point=entry_point,
         type_annotation="",
-        signature=signature,
+        signature=sig,
         objectmode=False,
         lifted=(),
         fndesc=fndesc,
         library=library,
-        environment=environment,
+        environment=env,
         reload_init=reload_init,
-        referenced_envs=referenced_envs,
+        referenced_envs=environments,
     )

@@ -33,7 +33,7 @@ _REFUSED = "delivered.refused"
 _DAY = 86_400.0
 # Longest wait for another process that compiles a kernel; most take less than a second.
 _CLAIM_SECONDS = 60.0
-# Limits of the folder. All kernels of one version of this package take 25 MB, of each family of processors.
+# Limits of the folder. All kernels of one version of this package take 10 MB, of each family of processors.
 MAX_BYTES = 1 << 29
 MAX_DAYS = 60.0
 
@@ -130,11 +130,8 @@ class KernelFiles:
             self._release(name)
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove a damaged file, and log that on the first occurrence; not without a fault."""
-        removed = self._remove(name)
-        if not fault:
-            return
-        outcome = "removed" if removed else "it cannot be removed: remove the folder"
+        """Remove a damaged file, and log that on the first occurrence."""
+        outcome = "removed" if self._remove(name) else "it cannot be removed: remove the folder"
         self._warn_once(
             "damaged",
             f"compiled kernels in {self.folder}: {name} is damaged ({fault}): {outcome}; "

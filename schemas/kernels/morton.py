@@ -5,13 +5,13 @@ halving the gap between groups at each line).
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import compiling as nb
 
 
-@nb.njit(nogil=True, cache=True)
 def _spread(value):
-    """Move bit i of a 21-bit uint64 to bit 3 i."""
+    """Move bit i of a 21-bit uint64, or of each in an array, to bit 3 i."""
     v = value & np.uint64(0x1FFFFF)
     v = (v | (v << np.uint64(32))) & np.uint64(0x001F00000000FFFF)
     v = (v | (v << np.uint64(16))) & np.uint64(0x001F0000FF0000FF)
@@ -20,7 +20,6 @@ def _spread(value):
     return (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
 
 
-@nb.njit(nogil=True, cache=True)
 def _gather(code):
     """Undo `_spread`."""
     v = code & np.uint64(0x1249249249249249)
@@ -31,29 +30,28 @@ def _gather(code):
     return (v | (v >> np.uint64(32))) & np.uint64(0x1FFFFF)
 
 
+_spread_one = nb.njit(nogil=True, cache=True)(_spread)
+_gather_one = nb.njit(nogil=True, cache=True)(_gather)
+
+
 @nb.njit(nogil=True, cache=True)
 def morton_code(x, y, z):
     """Return the Morton code, uint64, of three uint64 below 2^21."""
-    return _spread(x) | (_spread(y) << np.uint64(1)) | (_spread(z) << np.uint64(2))
+    return _spread_one(x) | (_spread_one(y) << np.uint64(1)) | (_spread_one(z) << np.uint64(2))
 
 
 @nb.njit(nogil=True, cache=True)
-def morton_encode(coordinates):
-    """Return the Morton codes (n,) uint64 of coordinates (n, 3) uint64, each below 2^21."""
-    n = coordinates.shape[0]
-    codes = np.empty(n, np.uint64)
-    for i in range(n):
-        codes[i] = morton_code(coordinates[i, 0], coordinates[i, 1], coordinates[i, 2])
-    return codes
+def morton_position(code):
+    """Return the coordinates x, y, z, uint64, of a Morton code."""
+    return _gather_one(code), _gather_one(code >> np.uint64(1)), _gather_one(code >> np.uint64(2))
 
 
-@nb.njit(nogil=True, cache=True)
-def morton_decode(codes):
-    """Return the coordinates (n, 3) uint64 of Morton codes (n,) uint64."""
-    n = codes.shape[0]
-    coordinates = np.empty((n, 3), np.uint64)
-    for i in range(n):
-        coordinates[i, 0] = _gather(codes[i])
-        coordinates[i, 1] = _gather(codes[i] >> np.uint64(1))
-        coordinates[i, 2] = _gather(codes[i] >> np.uint64(2))
-    return coordinates
+def morton_encode(coordinates: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the Morton codes (n,) of coordinates (n, 3), each below 2^21."""
+    x, y, z = (_spread(coordinates[:, k]) << np.uint64(k) for k in range(3))
+    return x | y | z
+
+
+def morton_decode(codes: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the coordinates (n, 3) of Morton codes (n,)."""
+    return np.stack([_gather(codes >> np.uint64(k)) for k in range(3)], axis=1)

@@ -72,7 +72,7 @@ def link_rows(count, cell_nodes, cell_points, first, is_leaf, cell_of):
     rest, point, height = top + c, 0, 0
     for i in range(c):
         levels, below = _walk(
-            count, int(cell_nodes[i]), top + i, rest, first, is_leaf, cell_of, i, point, False
+            count, np.int64(cell_nodes[i]), top + i, rest, first, is_leaf, cell_of, i, point, False
         )
         if levels < 0:
             return -1 - below
@@ -105,23 +105,6 @@ def delta_along(points, first, count, axis):
         for i in range(a + 1, a + count[run]):
             deltas[i, k] = points[i, k] - points[i - 1, k]
     return deltas
-
-
-@nb.njit(nogil=True, cache=True)
-def join_planes(planes, words):
-    """Join byte planes (k w, n) uint8, low bytes first, to words (k, n) of w bytes, unsigned.
-
-    This undoes HDF5's shuffle.
-    """
-    width = np.uint64(planes.shape[0] // words.shape[0])
-    for k in range(np.uint64(words.shape[0])):
-        out, first = words[k], planes[k * width]
-        for i in range(np.uint64(out.shape[0])):
-            out[i] = first[i]
-        for b in range(np.uint64(1), width):
-            plane, shift = planes[k * width + b], out.dtype.type(8 * b)
-            for i in range(np.uint64(out.shape[0])):
-                out[i] |= out.dtype.type(plane[i]) << shift
 
 
 @nb.njit(nogil=True, inline="always")

@@ -9,7 +9,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
-from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
+from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .level_of_detail import below, find_level, level_budget, level_reach
@@ -157,9 +157,11 @@ def verdict_bounds(
     """
     if budget.tolerance == 0:
         return {}
-    rounded, k = margin_units / UNITS_PER_METRE, len(verdict)
+    rounded = margin_units / UNITS_PER_METRE
     low, high = min(float(margin), rounded), max(float(margin), rounded)
-    early = float(np.nextafter(high + budget.tolerance, np.inf))
-    lower, upper, exact = np.empty(k), np.empty(k), np.empty(k, bool)
-    write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact)
+    early, found = verdict == EARLY, verdict == CONTACT
+    lower = np.where(verdict == CLEAR, low, -radii / UNITS_PER_METRE)
+    upper = np.where(found, high, np.where(early, np.nextafter(high + budget.tolerance, np.inf), np.inf))
+    exact = found | (verdict == CLEAR)
+    verdict[early] = CONTACT
     return {"lower": lower, "upper": upper, "exact": exact}

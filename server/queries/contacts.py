@@ -34,9 +34,9 @@ from ..kernels.contacts.contact_cells import (
     TAG,
     ContactOptions,
     ContactState,
+    list_pose,
     make_cells,
 )
-from ..kernels.contacts.contact_clusters import list_pose
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.node_overlap import STACK
 from ..kernels.core.reach import VoxelLists

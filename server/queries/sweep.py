@@ -11,8 +11,8 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
+from ..kernels.motion.sweep_resident import make_scratch
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
     find_unknown_regions,

@@ -230,9 +230,8 @@ def test_case_39_motions_enter_boxes_no_later_than_in_fractions() -> None:
             continue
         met += 1
         # The span as its callers widen it: a millionth of itself, one step, and the rounding far away.
-        boxes = low[None].astype(np.float64), high[None].astype(np.float64)
         wide = span * (1.0 + 1e-6) + 1.0 + max(np.abs(begin).max(), np.abs(end).max()) * 2.0**-49
-        found = entry_fraction(begin, end, wide, *boxes, 0)
+        found = entry_fraction(begin, end, wide, np.stack([low, high]).astype(np.float64))
         assert found != INFINITE and Fraction(found) <= first, (found, float(first))
     assert met > 50
 

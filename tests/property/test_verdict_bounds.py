@@ -1,39 +1,21 @@
-"""Test verdicts within a tolerance on production kernels: bounds, and no write beside the columns.
-
-The unit tests check indices, which changes the loop: LLVM once vectorised it to write beyond a column.
-"""
+"""Test verdicts within a tolerance: their bounds, and the pairs that are surely within it."""
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.collide.early_contact import (
-    CLEAR,
-    CONTACT,
-    EARLY,
-    UNKNOWN,
-    set_early,
-    write_verdict_bounds,
-)
-
-BESIDE = 128
+from solidcloud.server.kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN, set_early
+from solidcloud.server.queries.collide import verdict_bounds
+from solidcloud.server.queries.request import QueryBudget
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("k", [0, 1, 7, 8, 31, 57, 64, 65, 513])
-def test_verdicts_become_bounds_and_nothing_else_is_written(k: int) -> None:
-    rng = np.random.default_rng(k)
-    types = (np.uint8, np.int64, np.float64, np.float64, np.bool_)
-    buffers = [np.ones(k + 2 * BESIDE, kind) for kind in types]
-    verdict, radii, lower, upper, exact = (buffer[BESIDE : BESIDE + k] for buffer in buffers)
-    verdict[:], radii[:] = rng.integers(0, 4, k), rng.integers(0, 1 << 26, k)
-    said = verdict.copy()
-    write_verdict_bounds(verdict, radii, 0.25, 0.5, 0.75, lower, upper, exact)
-    assert (lower == np.where(said == CLEAR, 0.25, -radii / 2.0**26)).all()
-    highest = {CLEAR: np.inf, CONTACT: 0.5, UNKNOWN: np.inf, EARLY: 0.75}
-    assert upper.tolist() == [highest[one] for one in said.tolist()]
-    assert (exact == ((said == CLEAR) | (said == CONTACT))).all()
-    assert (verdict == np.where(said == EARLY, CONTACT, said)).all()
-    for buffer in buffers:
-        assert (buffer[:BESIDE] == 1).all() and (buffer[BESIDE + k :] == 1).all()
+def test_verdicts_become_bounds() -> None:
+    said = np.array([CLEAR, CONTACT, UNKNOWN, EARLY], np.uint8)
+    verdict, radii = said.copy(), np.arange(4) << 24
+    found = verdict_bounds(verdict, radii, 0.25, 1 << 24, QueryBudget(tolerance=0.125))
+    assert found["lower"].tolist() == [0.25, -0.25, -0.5, -0.75]
+    assert found["upper"].tolist() == [np.inf, 0.25, np.inf, np.nextafter(0.375, np.inf)]
+    assert found["exact"].tolist() == [True, True, False, False]
+    assert verdict.tolist() == [CLEAR, CONTACT, UNKNOWN, CONTACT]
 
 
 @pytest.mark.interpreted

@@ -46,7 +46,7 @@ def count_points(xyz, edge, origin, cubes, counts, known):
             if 4 * known[0] >= 3 * counts.shape[0]:
                 return i
             last = find_slot(at[0], at[1], at[2], cubes, counts)
-            before[:] = at
+            before[0], before[1], before[2] = at[0], at[1], at[2]
             if counts[last] == 0:
                 cubes[last, 0], cubes[last, 1], cubes[last, 2] = at[0], at[1], at[2]
                 known[0] += 1

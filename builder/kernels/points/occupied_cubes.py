@@ -75,7 +75,7 @@ def find_cube_points(xyz, origin, step, voxel_steps, chosen, table, known, picke
                     and chosen[c, 3] == at[2] >> chosen[c, 4]
                 ):
                     picked[count], slots[count] = i, c
-                    local[count] = at
+                    local[count, 0], local[count, 1], local[count, 2] = at[0], at[1], at[2]
                     count += 1
                     break
     return count, xyz.shape[0]

@@ -7,7 +7,7 @@ the steps. The compiler can then vectorise every loop without branches.
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.morton import morton_code, morton_decode
+from ....schemas.kernels.morton import morton_code, morton_position
 from .content_hash import mix_column, mixed_sum
 
 # Points per round of all steps.
@@ -170,7 +170,8 @@ def place_points(xyz, origin, step, voxel_steps, bias, more, seeds, voxels, numb
         if lowest < -bias or highest >= bias:
             return done, moved, lowest, highest
         for k in range(more.shape[0]):
-            steps[3 + k][:size] = more[k, done:end].view(np.int64)
+            for i in range(size):
+                columns[3 + k, i] = more[k, done + i]
         for k in range(2):
             hashed[:] = seeds[k]
             for c in range(columns.shape[0]):
@@ -209,8 +210,12 @@ def order_ties(codes, order, ranks):
         while end < n and codes[end] == codes[begin]:
             end += 1
         if end - begin > 32:
-            held = order[begin:end].copy()
-            order[begin:end] = held[np.argsort(ranks[held], kind="mergesort")]
+            held, own = order[begin:end].copy(), np.empty(end - begin, ranks.dtype)
+            for i in range(end - begin):
+                own[i] = ranks[held[i]]
+            sorted_by_rank = np.argsort(own, kind="mergesort")
+            for i in range(end - begin):
+                order[begin + i] = held[sorted_by_rank[i]]
         else:
             for i in range(begin + 1, end):
                 item = order[i]
@@ -225,8 +230,5 @@ def order_ties(codes, order, ranks):
 @nb.njit(nogil=True, cache=True)
 def fill_local(codes, local):
     """Write the coordinates of Morton codes (n,) into local (n, 3) int32."""
-    coordinates = morton_decode(codes)
     for i in range(codes.shape[0]):
-        local[i, 0] = coordinates[i, 0]
-        local[i, 1] = coordinates[i, 1]
-        local[i, 2] = coordinates[i, 2]
+        local[i, 0], local[i, 1], local[i, 2] = morton_position(codes[i])

@@ -96,10 +96,10 @@ class CompileNotice:
 def compile_notices() -> Iterator[None]:
     """Print lines on standard error while kernels are compiled in this block, by any process.
 
-    They replace the messages about this process alone (schemas/kernels/compile_progress.py).
+    They replace the messages about this process alone (schemas/kernels/compiling.py).
     """
     ended = threading.Event()
-    own = logging.getLogger("solidcloud.schemas.kernels.compile_progress")
+    own = logging.getLogger("solidcloud.schemas.kernels.compiling")
     level = own.level
     own.setLevel(logging.ERROR)
 

@@ -58,8 +58,16 @@ from ..core.scene_arrays import (
     stopped,
 )
 from ..core.voxels_in_reach import VALID, find_reach
-from .early_contact import CLEAR, EARLY, UNKNOWN, set_early, surely_near
-from .leaf_contact import below_touches, leaves_touch, make_collide_scratch
+from .leaf_contact import (
+    CLEAR,
+    EARLY,
+    UNKNOWN,
+    below_touches,
+    leaves_touch,
+    make_collide_scratch,
+    set_early,
+    surely_near,
+)
 
 U = np.uint64  # see placed_avatar.py
 

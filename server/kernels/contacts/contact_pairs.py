@@ -55,10 +55,10 @@ from .contact_cells import (
     find_slot,
     gather_point,
     grow_cells,
+    list_pose,
     listing_bound,
     square_below,
 )
-from .contact_clusters import list_pose
 
 U = np.uint64  # see placed_avatar.py
 

@@ -90,7 +90,8 @@ def lay_boxes(nodes, block_words, step, arena, where):
                 ints, halves, where[1] + ~first * block_words, where[2] + ~first * 3 * LANES, boxes, node
             )
         else:
-            boxes[node] = boxes[first]
+            for k in range(6):
+                boxes[node, k] = boxes[first, k]
             for child in range(first + 1, first + np.int64(ints[row + COUNT] & COUNTED)):
                 for k in range(3):
                     boxes[node, k] = min(boxes[node, k], boxes[child, k])

@@ -160,13 +160,12 @@ def _entry(bx, by, bz, ex, ey, ez, span, low, high, at):
 
 
 @njit_no_refcount
-def entry_fraction(begin, end, span, low, high, at):
-    """Return the fraction of its way at which a moving cube first meets the box low[at] to high[at].
+def entry_fraction(begin, end, span, box):
+    """Return the fraction of its way at which a moving cube first meets a box (2, 3).
 
-    begin, end: (3,), its centre.  span: half its edge.  low, high: (n, 3). Rounded down; inf if it does
-    not meet the box.
+    begin, end: (3,), its centre.  span: half its edge. Rounded down; inf if it does not meet the box.
     """
-    return _entry(begin[0], begin[1], begin[2], end[0], end[1], end[2], span, low, high, at)
+    return _entry(begin[0], begin[1], begin[2], end[0], end[1], end[2], span, box[:1], box[1:], 0)
 
 
 @njit_no_refcount
@@ -252,8 +251,7 @@ def unknown_near(tree, begin, end, span, own):
             else:
                 square += (end[r] - begin[r]) ** 2
         if not still:
-            low, high = unknown[:, 0], unknown[:, 1]
-            least = min(least, entry_fraction(begin, end, span, low, high, u) * math.sqrt(square))
+            least = min(least, entry_fraction(begin, end, span, unknown[u]) * math.sqrt(square))
         elif square <= span * span:
             least = min(least, max(math.sqrt(square) * (1.0 - 1e-9) - own, 0.0))
     return least

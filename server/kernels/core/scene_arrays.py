@@ -249,17 +249,14 @@ def lay_classes(links, classes, ints, where):
         ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | (own << CLASS_SHIFT) | (own << LEAF_CLASS_SHIFT)
 
 
-@nb.njit(nogil=True, cache=True)
-def lay_node_class(nodes, own, ints, where):
+def lay_node_class(nodes: int, own: int, ints: NDArray[np.int32], where: NDArray[np.int64]) -> None:
     """Replace the radius class of all nodes of a voxel, `nodes` of them, by `own`.
 
     The classes of leaf nodes' blocks stay.
     """
-    row = where[0]
-    for _ in range(nodes):
-        of_block = ints[row + COUNT] >> LEAF_CLASS_SHIFT << LEAF_CLASS_SHIFT
-        ints[row + COUNT] = np.int32(of_block | (own << CLASS_SHIFT) | (ints[row + COUNT] & COUNTED))
-        row += ROW_WORDS
+    counts = ints[where[0] :][: nodes * ROW_WORDS].reshape(nodes, ROW_WORDS)[:, COUNT]
+    of_block = counts >> LEAF_CLASS_SHIFT << LEAF_CLASS_SHIFT
+    counts[:] = of_block | (own << CLASS_SHIFT) | (counts & COUNTED)
 
 
 @nb.intrinsic
@@ -292,5 +289,6 @@ def copy_rows(rows, to, count, flag):
     for begin in range(0, count, ROWS_AT_ONCE):
         if stopped(flag):
             return
-        end = min(begin + ROWS_AT_ONCE, count)
-        to[begin:end] = rows[begin:end]
+        for row in range(begin, min(begin + ROWS_AT_ONCE, count)):
+            for c in range(rows.shape[1]):
+                to[row, c] = rows[row, c]

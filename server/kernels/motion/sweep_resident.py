@@ -3,9 +3,17 @@
 The result is that of server/queries/sweep.py. The cost of a motion is then only its search: the
 arrays are passed by reference (array_references.py), and each inspection of a result's contents
 costs another call.
+
+A motion that touches ends `skin` before the contact. The operations and their order are those of
+server/simulation/world/frame.py, which computes the same for obstacles that are not of the scan. In
+one call with the sweep they take a tenth of the time.
 """
 
+import math
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
@@ -13,10 +21,16 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.reach import all_resident
 from ..core.scene_arrays import SceneArrays, stopped
 from ..core.voxels_in_reach import VALID, check_poses
-from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
+from .moving_avatar import MovingAvatar, make_moving
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments
-from .sweep_segments import find_unknown_regions, plan_segments
+from .sweep_segments import (
+    PlanSpace,
+    SweepProgress,
+    find_unknown_regions,
+    make_plan_space,
+    plan_segments,
+)
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -28,6 +42,139 @@ _NOT_ANSWERED = (-1, _UNKNOWN, 0, 0, 0)
 LOWER, UPPER, SPEED, AVATAR, CLOUD, ENDED, POINT, END, COLUMNS = 0, 1, 2, 3, 6, 9, 10, 13, 29
 # How a motion ends: not known, or the pose may touch; where it began; at a pose that is proved clear.
 OPEN, STAYS, PROVED = 0.0, 1.0, 2.0
+# Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
+# `lower`.
+MIN_MOTION = 2e-5
+# If a motion is undecided for more than this distance before its contact, it ends where the
+# undecided part begins [m].
+MAX_UNDECIDED = 1e-4
+# Limit on the distance by which a motion stops before a contact, as a multiple of `skin`. In a
+# grazing motion, the distance that keeps `skin` from the wall would be long.
+MAX_SKIN_FACTOR = 4.0
+
+
+class OneMotion(NamedTuple):
+    """Arrays of one motion, as those of k in sweep_segments.py and sweep_advance.py; scratch.
+
+    first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.
+    origin: (3,), zero.  pose: (4, 4).  The others are (1,).
+    """
+
+    first: NDArray[np.float64]
+    last: NDArray[np.float64]
+    units: NDArray[np.int64]
+    progress: SweepProgress
+    counts: NDArray[np.uint32]
+    which: NDArray[np.int64]
+    cursor: NDArray[np.int64]
+    moved: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    pose: NDArray[np.float64]
+
+
+if nb.config.DISABLE_JIT:
+
+    class MotionScratch(NamedTuple):
+        """Reference to the scratch of an avatar's motions, see array_references.py."""
+
+        moving: MovingAvatar
+        space: PlanSpace
+        one: OneMotion
+
+else:
+
+    @nb.structref.register
+    class _MotionScratchType(nb.types.StructRef):  # type: ignore[misc]
+        """numba's type of a `MotionScratch`."""
+
+    class MotionScratch(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
+        """Reference to the scratch of an avatar's motions, see array_references.py."""
+
+    nb.structref.define_proxy(MotionScratch, _MotionScratchType, ["moving", "space", "one"])
+
+
+@nb.njit(nogil=True, cache=True)
+def make_scratch(avatar):
+    """Allocate the scratch for an avatar, not empty. It serves one motion at a time."""
+    progress = SweepProgress(
+        np.zeros(1), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), np.zeros((1, 2, 3)), np.zeros(1), np.zeros(1)
+    )  # fmt: skip
+    one = OneMotion(
+        np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1, np.int64), progress, np.zeros((4, 1), np.uint32),
+        np.zeros(1, np.int64), np.zeros(1, np.int64), np.empty(1), np.zeros(3), np.empty((4, 4)),
+    )  # fmt: skip
+    return MotionScratch(make_moving(avatar), make_plan_space(), one)
+
+
+@njit_no_refcount
+def _norm(x, y, z):
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit_no_refcount
+def longest_way(pose_from, pose_to, avatar):
+    """Return an approximate bound of the distance that any avatar point moves [m].
+
+    pose_from, pose_to: (4, 4).
+    """
+    wx, wy, wz = (
+        pose_to[0, 3] - pose_from[0, 3],
+        pose_to[1, 3] - pose_from[1, 3],
+        pose_to[2, 3] - pose_from[2, 3],
+    )
+    square, same = 0.0, True
+    for r in range(3):
+        for c in range(3):
+            turn = pose_to[r, c] - pose_from[r, c]
+            same &= pose_to[r, c] == pose_from[r, c]
+            square += turn * turn
+    if same:
+        return _norm(wx, wy, wz)
+    x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
+    wx += _turned(pose_from, pose_to, 0, x, y, z)
+    wy += _turned(pose_from, pose_to, 1, x, y, z)
+    wz += _turned(pose_from, pose_to, 2, x, y, z)
+    return _norm(wx, wy, wz) + math.sqrt(square) * avatar.radius[0]
+
+
+@njit_no_refcount
+def _turned(pose_from, pose_to, r, x, y, z):
+    """Return coordinate r of the displacement of a place by the rotation from one pose to another."""
+    a, b, c = (
+        pose_to[r, 0] - pose_from[r, 0],
+        pose_to[r, 1] - pose_from[r, 1],
+        pose_to[r, 2] - pose_from[r, 2],
+    )
+    return a * x + b * y + c * z
+
+
+@njit_no_refcount
+def write_point(pose, place, point):
+    """Write a place (3,), world, in the frame of a pose (4, 4) to point (3,)."""
+    x, y, z = place[0] - pose[0, 3], place[1] - pose[1, 3], place[2] - pose[2, 3]
+    for k in range(3):
+        point[k] = pose[0, k] * x + pose[1, k] * y + pose[2, k] * z
+
+
+@njit_no_refcount
+def skin_fraction(pose_from, pose_to, own, cloud, point, way, skin):
+    """Return the share of a motion by which to stop before a contact.
+
+    The avatar is then `skin` [m] away from the tangent plane of the two spheres.
+    own, cloud: (3,), their centres, world.  point: (3,), that of the avatar's in its own frame.
+    way: `longest_way`.
+    """
+    if way <= 0.0 or skin <= 0.0:
+        return 0.0
+    ox, oy, oz = own[0] - cloud[0], own[1] - cloud[1], own[2] - cloud[2]
+    gx = (pose_to[0, 3] - pose_from[0, 3]) + _turned(pose_from, pose_to, 0, point[0], point[1], point[2])
+    gy = (pose_to[1, 3] - pose_from[1, 3]) + _turned(pose_from, pose_to, 1, point[0], point[1], point[2])
+    gz = (pose_to[2, 3] - pose_from[2, 3]) + _turned(pose_from, pose_to, 2, point[0], point[1], point[2])
+    length, speed = _norm(ox, oy, oz), _norm(gx, gy, gz)
+    if speed <= 1e-9 * way:
+        return min(1.0, skin / way)
+    into = speed if length == 0.0 else -(gx * ox + gy * oy + gz * oz) / length
+    return skin / max(into, speed / MAX_SKIN_FACTOR)
 
 
 @nb.njit(nogil=True, cache=True)

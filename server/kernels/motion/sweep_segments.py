@@ -152,7 +152,7 @@ def plan_segments(box, first, last, avatar, units, scene, tree, which, progress,
             span = place_root_sphere(motion, t, avatar, units[i], scene, pose, shift, begin)
             span = max(span, place_root_sphere(motion, stop, avatar, units[i], scene, pose, shift, end))
             span += sagitta_of(motion, stop - t, scene)
-            if entry_fraction(begin, end, span, tree.scene[:1], tree.scene[1:], 0) < INFINITE:
+            if entry_fraction(begin, end, span, tree.scene) < INFINITE:
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue
@@ -208,6 +208,6 @@ def find_unknown_regions(box, first, last, avatar, units, scene, tree, until, ou
                 outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]
                 outside[i] |= max(begin[r], end[r]) + span > tree.scene[1, r]
             for u in range(tree.unknown.shape[0]):
-                met = entry_fraction(begin, end, span, tree.unknown[:, 0], tree.unknown[:, 1], u)
+                met = entry_fraction(begin, end, span, tree.unknown[u])
                 if met < INFINITE:
                     unknown_from[i] = min(unknown_from[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..motion.motion_end import MIN_MOTION
+from ..motion.sweep_resident import MIN_MOTION
 from .ground_search import lower_by, move_by, search_below
 from .stand_on_ground import DEAD_BAND
 from .walk_motions import keep_rest, move_to

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..motion.motion_scratch import make_scratch
+from ..motion.sweep_resident import make_scratch
 from .slide_along import slide_command
 from .stand_on_ground import stand_on_ground
 from .step_up import step_up

@@ -8,8 +8,7 @@ With the effect `sweep`, a motion stops the skin before the first contact, at a 
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..motion.motion_end import MIN_MOTION, skin_fraction
-from ..motion.sweep_resident import END, LOWER, POINT
+from ..motion.sweep_resident import END, LOWER, MIN_MOTION, POINT, skin_fraction
 from .walk_queries import (
     farthest_motion,
     first_hit,

@@ -8,18 +8,19 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID
-from ..motion.motion_end import MAX_UNDECIDED, longest_way
 from ..motion.sweep_resident import (
     AVATAR,
     CLOUD,
     END,
     ENDED,
     LOWER,
+    MAX_UNDECIDED,
     OPEN,
     POINT,
     PROVED,
     SPEED,
     UPPER,
+    longest_way,
     pose_between,
     sweep_resident,
 )

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference
-from ..motion.motion_scratch import MotionScratch
-from ..motion.sweep_resident import COLUMNS
+from ..motion.sweep_resident import COLUMNS, MotionScratch
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 

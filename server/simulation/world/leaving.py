@@ -15,7 +15,7 @@ from ...archives.ask_archives import HeldArchive
 from ...archives.rigid_transform import transform_points
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
-from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
+from ...kernels.motion.sweep_resident import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
 from ...queries.request import QueryBudget, parts_that_fit
 from .frame import (
     Frame,

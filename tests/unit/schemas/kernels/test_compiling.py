@@ -1,6 +1,7 @@
 """Test starts with damaged compiled kernels: right answers, exit code 0, and one warning."""
 
 import json
+import logging
 import os
 import pickle
 import random
@@ -9,8 +10,10 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from solidcloud.schemas.kernels import compiling
 from solidcloud.schemas.kernels.compiling import njit
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 
@@ -21,12 +24,12 @@ pytestmark = pytest.mark.skipif(
 CODE = """
 import json
 import numpy as np
-from solidcloud.schemas.kernels.morton import morton_decode, morton_encode
-codes = morton_encode(np.array([[1, 2, 3], [7, 0, 5]], np.uint64))
+from solidcloud.schemas.kernels.morton import morton_code, morton_position
+codes = [morton_code(*xyz) for xyz in np.array([[1, 2, 3], [7, 0, 5]], np.uint64)]
 print(json.dumps({
-    "codes": codes.tolist(),
-    "decoded": morton_decode(codes).tolist(),
-    "compiled": sum(sum(kernel.stats.cache_misses.values()) for kernel in (morton_encode, morton_decode)),
+    "codes": codes,
+    "decoded": [morton_position(np.uint64(code)) for code in codes],
+    "compiled": sum(sum(kernel.stats.cache_misses.values()) for kernel in (morton_code, morton_position)),
 }))
 """
 # Starts with each cache, twice each: children of one process that has imported numba, and nothing of solidcloud.
@@ -98,7 +101,7 @@ def cache(warm: Path, tmp_path: Path) -> Path:
 def kernels(cache: Path) -> list[Path]:
     """The files that a warm start reads."""
     folder = cache / "solidcloud-kernels"
-    return sorted([*folder.glob("*.morton_encode-*"), *folder.glob("*.morton_decode-*")])
+    return sorted([*folder.glob("*.morton_code-*"), *folder.glob("*.morton_position-*")])
 
 
 def test_a_warm_start_compiles_nothing_and_is_silent(cache: Path) -> None:
@@ -176,6 +179,17 @@ def test_a_damaged_kernel_is_compiled_again(
     assert json.loads(out) == ANSWER | {"compiled": 1 if damage == "other name" else 2}
     assert len(said.splitlines()) == 1 and "is damaged" in said and cache in said
     assert (again[0], json.loads(again[1]), again[2]) == (0, ANSWER | {"compiled": 0}, "")
+
+
+def test_a_long_compilation_is_reported_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, times = compiling._KernelStore(), iter([100.0, 100.5, 101.5, 120.0])
+    monkeypatch.setattr(compiling, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    with caplog.at_level(logging.INFO, compiling.__name__):
+        for reported in (0, 0, 1, 1):
+            store._begin()
+            assert len(caplog.messages) == reported
 
 
 def test_a_kernel_with_variables_of_its_surroundings_is_refused() -> None:

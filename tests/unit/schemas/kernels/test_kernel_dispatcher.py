@@ -52,7 +52,7 @@ def test_an_inner_kernel_holds_its_own_code_and_names_what_it_calls() -> None:
     defined = [each.name for each in library.own_module().functions if not each.is_declaration]
     assert any("eighth" in name for name in defined)
     assert not any("half" in name or "quarter" in name for name in defined)
-    assert sorted(callee.key[1] for callee in library.callees) == ["half", "quarter"]
+    assert sorted(callee.name for callee in library.callees) == ["half", "quarter"]
 
 
 def test_what_calls_is_linked_before_what_it_calls() -> None:
@@ -60,5 +60,5 @@ def test_what_calls_is_linked_before_what_it_calls() -> None:
     eighth.inner.compile((types.float64,))
     library = eighth.inner.overloads[types.float64,].library
     for callees in (library.callees, library.callees[::-1]):
-        assert [each.key[1] for each in in_order(callees)] == ["quarter", "half"]
+        assert [each.name for each in in_order(callees)] == ["quarter", "half"]
     assert eighth(4.0) == 0.5

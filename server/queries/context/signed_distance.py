@@ -23,6 +23,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.nearest_pair import NearestPairs
+from ...kernels.nearest.nearest_search import AVATAR, CLOUD, COLUMNS, LOWER, NORMAL, SIGNED, write_results
 from .query_context import SceneData
 
 
@@ -34,17 +35,6 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
     above = (square - radii * radii).astype(np.float64)
     both = np.sqrt(square.astype(np.float64)) + radii.astype(np.float64)
     return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
-
-
-def signed_bound(
-    steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return lower bounds (k,) of the signed distance [m] for centres at least `steps` apart.
-
-    radii: (k,) sum of the largest radii of avatar and scan, exact units.
-    """
-    metres = steps * data.arrays.step * (1.0 - 1e-12)
-    return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
 
 
 def unknown_gaps(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
@@ -79,35 +69,14 @@ def distance_columns(
     nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
     examined.
     """
-    radii = reach.units - reach_units  # of the largest spheres
-    found = nearest.square >= 0
-    signed = np.where(
-        found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.deficit), np.inf
-    )
-    floor = np.maximum(signed_bound(nearest.missing_bound, data, radii), -radii / UNITS_PER_METRE)
-    # `farthest` may exceed the reach in exact units by a rounding.
-    exact = floor >= np.where(found, signed, farthest)
-    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(signed, floor), farthest))
-    verdict = np.where(signed <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
-    verdict[exact & (signed > 0)] = Verdict.CLEAR
-    origin = data.arrays.origin
-    difference = (nearest.pair[:, 3:] - _units_of(data, nearest.pair[:, :3])).astype(np.float64)
-    length = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64))[:, None]
-    normal = np.divide(difference, length, out=np.zeros((len(found), 3)), where=length > 0)
-    nowhere = ~found
-    witness_avatar = nearest.pair[:, 3:] / UNITS_PER_METRE + origin
-    witness_cloud = (
-        nearest.pair[:, :3] * data.arrays.step + origin
-    )  # as schemas/archive/voxel_grid.py Lattice.to_world
-    for column in (normal, witness_avatar, witness_cloud):
-        column[nowhere] = np.nan
+    k = len(nearest.square)
+    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
+    write_results(nearest, reach.units - reach_units, farthest, data.arrays, results, exact)
+    signed, lower = results[:, SIGNED].copy(), results[:, LOWER].copy()
+    clear = np.where(exact | (lower > 0), Verdict.CLEAR, Verdict.UNKNOWN)
     return {
-        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": signed.copy(),
-        "exact": exact, "witness_avatar": witness_avatar, "witness_cloud": witness_cloud, "normal": normal,
+        "verdict": np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), "signed_distance": signed,
+        "lower": lower, "upper": signed.copy(), "exact": exact, "witness_avatar": results[:, AVATAR:CLOUD].copy(),
+        "witness_cloud": results[:, CLOUD:].copy(), "normal": results[:, NORMAL:AVATAR].copy(),
         "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
     }  # fmt: skip
-
-
-def _units_of(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert lattice points to exact units (k, 3): one product, half to even (NUMERICS.md N5)."""
-    return np.rint(lattice.astype(np.float64) * data.arrays.units_per_step).astype(np.int64)

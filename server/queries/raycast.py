@@ -14,7 +14,7 @@ from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.rays.hits import ClosestHits, HitBatch
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
-from .nearest_hits import find_hits, make_origins
+from .nearest_hits import find_hits, leaves_scene, make_origins
 from .resolve import Steps, run
 
 # Differences within this reach [m] are exact in float64: 2^53 units are 134,000 km.
@@ -80,9 +80,7 @@ def raycast_steps(
         length = np.sqrt((away * away).sum(axis=1))[:, None]
         normal[which] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
 
-    low, high = np.rint(data.tree.scene * data.arrays.units_per_step)
-    ends = units.astype(np.float64), units + float(reach_units) * unit
-    outside = np.any([(end < low) | (end > high) for end in ends], axis=(0, 2))
+    outside = leaves_scene(data, units.astype(np.float64), units + float(reach_units) * unit)
     rays = HitBatch(units, unit, reach_units, data.radius_units)
     hits = yield from find_hits(data, rays, budget, spent, on_hits)
     return RaycastAnswers(

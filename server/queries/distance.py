@@ -26,11 +26,20 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
-from ..kernels.nearest.nearest_search import nearest_poses
+from ..kernels.nearest.nearest_search import (
+    AVATAR,
+    CLOUD,
+    COLUMNS,
+    LOWER,
+    NORMAL,
+    SIGNED,
+    nearest_poses,
+    write_results,
+)
 from .level_of_detail import below, find_level, level_budget, level_reach
 from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
 from .resolve import Search, Steps, answered, drop_items, load_and_search, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, to_world, with_stop
+from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
@@ -213,17 +222,6 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
     return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
 
 
-def signed_bound(
-    steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return lower bounds (k,) of the signed distance [m] for centres at least `steps` apart.
-
-    radii: (k,) sum of the largest radii of avatar and scan, exact units.
-    """
-    metres = steps * data.arrays.step * (1.0 - 1e-12)
-    return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
-
-
 def _columns(
     data: SceneData,
     reach: VoxelsInReach,
@@ -238,33 +236,14 @@ def _columns(
     nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
     examined.
     """
-    radii = reach.units - reach_units  # of the largest spheres
-    found = nearest.square >= 0
-    signed = np.where(
-        found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.deficit), np.inf
-    )
-    floor = np.maximum(signed_bound(nearest.missing_bound, data, radii), -radii / UNITS_PER_METRE)
-    # `farthest` may exceed the reach in exact units by a rounding.
-    exact = floor >= np.where(found, signed, farthest)
-    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(signed, floor), farthest))
-    verdict = np.where(signed <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
-    verdict[exact & (signed > 0)] = Verdict.CLEAR
-    origin = data.arrays.origin
-    difference = (nearest.pair[:, 3:] - _units_of(data, nearest.pair[:, :3])).astype(np.float64)
-    length = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64))[:, None]
-    normal = np.divide(difference, length, out=np.zeros((len(found), 3)), where=length > 0)
-    nowhere = ~found
-    witness_avatar = nearest.pair[:, 3:] / UNITS_PER_METRE + origin
-    witness_cloud = to_world(data, nearest.pair[:, :3])
-    for column in (normal, witness_avatar, witness_cloud):
-        column[nowhere] = np.nan
+    k = len(nearest.square)
+    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
+    write_results(nearest, reach.units - reach_units, farthest, data.arrays, results, exact)
+    signed, lower = results[:, SIGNED].copy(), results[:, LOWER].copy()
+    clear = np.where(exact | (lower > 0), Verdict.CLEAR, Verdict.UNKNOWN)
     return {
-        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": signed.copy(),
-        "exact": exact, "witness_avatar": witness_avatar, "witness_cloud": witness_cloud, "normal": normal,
+        "verdict": np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), "signed_distance": signed,
+        "lower": lower, "upper": signed.copy(), "exact": exact, "witness_avatar": results[:, AVATAR:CLOUD].copy(),
+        "witness_cloud": results[:, CLOUD:].copy(), "normal": results[:, NORMAL:AVATAR].copy(),
         "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
     }  # fmt: skip
-
-
-def _units_of(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert lattice points to exact units (k, 3): one product, half to even (NUMERICS.md N5)."""
-    return np.rint(lattice.astype(np.float64) * data.arrays.units_per_step).astype(np.int64)

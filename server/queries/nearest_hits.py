@@ -52,6 +52,16 @@ def make_origins(
     return array, np.rint((array - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
 
 
+def leaves_scene(data: SceneData, *places: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which of k items have a place (k, 3), exact units, outside of the box of all scan points."""
+    low, high = np.rint(data.tree.scene * data.arrays.units_per_step).astype(places[0].dtype)
+    outside = np.zeros(len(places[0]), bool)
+    for place in places:
+        for r in range(3):  # `any` along rows of three takes longer
+            outside |= (place[:, r] < low[r]) | (place[:, r] > high[r])
+    return outside
+
+
 def find_hits(
     data: SceneData,
     items: HitBatch,

@@ -11,7 +11,7 @@ from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.rays.hits import ClosestHits, HitBatch
-from .nearest_hits import find_hits, make_origins
+from .nearest_hits import find_hits, leaves_scene, make_origins
 from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
 from .scene_data import SceneData, to_units
@@ -80,9 +80,7 @@ def raycast_steps(
         length = np.sqrt((away * away).sum(axis=1))[:, None]
         normal[which] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
 
-    low, high = np.rint(data.tree.scene * data.arrays.units_per_step)
-    ends = units.astype(np.float64), units + float(reach_units) * unit
-    outside = np.any([(end < low) | (end > high) for end in ends], axis=(0, 2))
+    outside = leaves_scene(data, units.astype(np.float64), units + float(reach_units) * unit)
     rays = HitBatch(units, unit, reach_units, data.radius_units)
     hits = yield from find_hits(data, rays, budget, spent, on_hits)
     return RaycastAnswers(

@@ -7,7 +7,7 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.rays.hits import HitBatch
-from .nearest_hits import find_hits, make_origins
+from .nearest_hits import find_hits, leaves_scene, make_origins
 from .request import EXACT, CostCounter, QueryBudget
 from .resolve import Steps, run
 from .scene_data import SceneData, to_units
@@ -33,8 +33,7 @@ def within_steps(
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
-    low, high = np.rint(data.tree.scene * data.arrays.units_per_step).astype(np.int64)
-    outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
+    outside = leaves_scene(data, units - reach_units, units + reach_units)
     hits = yield from find_hits(data, HitBatch(units, np.empty((0, 3)), reach_units, 0), budget, spent)
     return WithinAnswers(
         hits.verdict, hits.distance, hits.lower, hits.distance.copy(), hits.exact, hits.cloud, outside,

@@ -406,24 +406,44 @@ def _nearest_poses(
 
 
 @njit_no_refcount
-def _write_result(square, pair, deficit, radii, reach, scene, result):
-    """Write the results for one pair, or for no pair (square -1); see `nearest_resident`."""
-    if square < 0:
-        result[SIGNED], result[LOWER] = np.inf, reach
-        for at in range(NORMAL, COLUMNS):
-            result[at] = np.nan
-        return
-    own = radii - deficit
-    above = np.float64(square - own * own)
-    root = math.sqrt(np.float64(square))
-    both = root + np.float64(own)
-    signed = above / both / UNITS_PER_METRE if both > 0.0 else 0.0
-    result[SIGNED], result[LOWER] = signed, min(signed, reach)
-    for r in range(3):
-        apart = np.float64(pair[3 + r] - lattice_to_units(pair[r], scene.units_per_step))
-        result[NORMAL + r] = apart / root if root > 0.0 else 0.0
-        result[AVATAR + r] = np.float64(pair[3 + r]) / UNITS_PER_METRE + scene.origin[r]
-        result[CLOUD + r] = np.float64(pair[r]) * scene.step + scene.origin[r]
+def _write_result(nearest, i, radii, reach, scene, result):
+    """Write the results of pose i, see `nearest_resident`; return whether they are exact.
+
+    radii: sum of the largest radii of avatar and scan, exact units.  reach: the largest distance
+    requested [m], which may exceed the same in exact units by a rounding.
+    queries/context/queries/distance.py defines the signed distance, in this order of operations.
+    """
+    square, pair, deficit, signed = nearest.square[i], nearest.pair[i], nearest.deficit[i], np.inf
+    for at in range(NORMAL, COLUMNS):
+        result[at] = np.nan
+    if square >= 0:
+        own = radii - deficit
+        above, root = np.float64(square - own * own), math.sqrt(np.float64(square))
+        both = root + np.float64(own)
+        signed = above / both / UNITS_PER_METRE if both > 0.0 else 0.0
+        for r in range(3):
+            apart = np.float64(pair[3 + r] - lattice_to_units(pair[r], scene.units_per_step))
+            result[NORMAL + r] = apart / root if root > 0.0 else 0.0
+            result[AVATAR + r] = np.float64(pair[3 + r]) / UNITS_PER_METRE + scene.origin[r]
+            result[CLOUD + r] = np.float64(pair[r]) * scene.step + scene.origin[r]
+    # Of what was not examined; no two centres are nearer than 0.
+    depth = np.float64(radii) / UNITS_PER_METRE
+    floor = nearest.missing_bound[i] * scene.step * (1.0 - 1e-12) - depth - 2.0 / UNITS_PER_METRE
+    floor = max(floor, -depth)
+    exact = floor >= (signed if square >= 0 else reach)
+    result[SIGNED], result[LOWER] = signed, min(signed if exact else min(signed, floor), reach)
+    return exact
+
+
+@nb.njit(nogil=True, cache=True)
+def write_results(nearest, radii, reach, scene, results, exact):
+    """Write results (k, COLUMNS) of the pairs found, as `nearest_resident` does, and exact (k,) bool.
+
+    radii: (k,) sums of the largest radii of avatar and scan, exact units.  reach: as requested [m].
+    exact: whether nothing that was not examined can be nearer.
+    """
+    for i in range(radii.shape[0]):
+        exact[i] = _write_result(nearest, i, radii[i], reach, scene, results[i])
 
 
 @nb.njit(nogil=True, cache=True)
@@ -431,9 +451,7 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
     """Answer `distance` for one pose in one call, where the resident voxels suffice.
 
     They do if all in the pose's reach are resident, or all that can hold a pair nearer than the one
-    found. This is `find_reach`, `nearest_poses`, and the conversion of the pair to metres by the
-    formulas of `queries/distance.py` in the same order of operations: the bits are the same. As numpy
-    operations on columns of one element, it took four times as long as the search.
+    found. This is `find_reach`, `nearest_poses` and `write_results`.
 
     pose: (1, 4, 4) float64, unchecked.  body, held: references to the arrays of the avatar and the
     scene (array_references.py).  stop: (1,) int64, the request's stop flag.  radius: of the avatar's
@@ -466,13 +484,6 @@ def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held,
         )  # fmt: skip
         if stopped(stop) or (front < needed and not nothing_nearer(nearest, 0, lists.near[front], scene)):
             return fault, found, -1, 0, 0
-    _write_result(
-        nearest.square[0],
-        nearest.pair[0],
-        nearest.deficit[0],
-        around.units[0] - reach_units,
-        reach,
-        scene,
-        result,
-    )
+    nearest.missing_bound[0] = np.inf
+    _write_result(nearest, 0, around.units[0] - reach_units, reach, scene, result)
     return fault, found, front, np.int64(counts[1, 0]), np.int64(counts[2, 0])

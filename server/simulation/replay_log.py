@@ -169,6 +169,7 @@ class FrameLog:
                 f"{path}: the log cannot be written: {write_error_words(error, self._path)}"
             ) from None
         self._known: set[str] = set()
+        self._clients: set[str] = set()  # whose users entered
         self.frame = LoggedFrame()
         self._write(MAGIC + _line(head))
 
@@ -194,6 +195,13 @@ class FrameLog:
             added = AddAvatarRequest(user.avatar, avatar.points, avatar.radius, avatar.inner_points)
             self.frame.avatars[digest] = encode(added)
         self.frame.entered.append((user, digest))
+        self._clients.add(user.client)
+
+    def dropped(self, client: str) -> None:
+        """Record that a client's avatars were dropped. A client none of whose users entered has none in a replay."""
+        if client in self._clients:
+            self._clients.remove(client)
+            self.frame.dropped.append(client)
 
     def turn(
         self,

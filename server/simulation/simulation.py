@@ -48,7 +48,7 @@ from ..queries.request import LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
 from .replay_log import FrameLog, LoggedTurn, take_record
-from .world.frame import MAX_TOUCHED, Body, Pose, Vec
+from .world.frame import MAX_TOUCHED, Body, Pose, Vec, translated
 from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
@@ -320,7 +320,7 @@ class Simulation:
             self._remove([user for user in self._present if user.client == client])
             self.scene.forget_client(client)
             if self._recorder is not None:
-                self._recorder.frame.dropped.append(client)
+                self._recorder.dropped(client)
 
     def warm(self) -> None:
         """Simulate some frames, so that no user waits for compilation. Nobody else may use this simulation.
@@ -335,13 +335,12 @@ class Simulation:
         far = min(0.5, self.file.limits.longest_move / 4)
         for way in (self._up, -self._up, across, self._up + across, 0 * across):
             for begin, end in ((way, -way), (-0 * way, way), (way, way + across)):
-                poses = np.tile(np.eye(4), (2, 1, 1, 1))
-                poses[:, 0, :3, 3] = place + far * begin, place + far * end
+                first, last = (translated(np.eye(4), place + far * each) for each in (begin, end))
                 with self._frame, suppress(SolidcloudError):  # such a frame may be impossible here
-                    body = _make_body(user, self.scene.avatar("warm", _WARM), poses[0, 0])
+                    body = _make_body(user, self.scene.avatar("warm", _WARM), first)
                     if self._bodies is not None:
-                        self._bodies[other] = _make_body(other, body.avatar, poses[:, 0].mean(axis=0))
-                    for pose in (poses[1, 0], poses[1, 0], poses[0, 0]):
+                        self._bodies[other] = _make_body(other, body.avatar, (first + last) / 2)
+                    for pose in (last, last, first):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
         if self._bodies is not None:
             self._bodies.pop(other)

@@ -196,6 +196,10 @@ class ClientSession(Session):
             last, now = self._last, monotonic()
             if last is None or last.seq <= self._answered or self._stack is None:
                 return
+            # A query that was sent just now may reach the server after the command. The answer would then
+            # be a reply to the query before, which nobody reads any more.
+            if now - self._states.sent < _REPEAT_SECONDS / 2:
+                return
             if now - self._published >= _REPEAT_SECONDS and now - self._sent < _MAX_REPEAT_SECONDS:
                 try:
                     self._publish(last)

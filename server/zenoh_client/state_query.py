@@ -28,7 +28,10 @@ _QUERY_SECONDS = 3600.0
 
 
 class StateQuery:
-    """The query for one user's states. One thread calls `take`; another may call `end`."""
+    """The query for one user's states. One thread calls `take`; another may call `end`.
+
+    sent: when it was sent last, on the monotonic clock [s].
+    """
 
     def __init__(
         self, session: zenoh.Session, key: str, anchor: TrustAnchor, about: Callable[[], bytes | None]
@@ -42,7 +45,7 @@ class StateQuery:
         self._arrived: queue.SimpleQueue[tuple[SealedQuery, Any] | None] = queue.SimpleQueue()
         self._query: SealedQuery | None = None  # the open one, or the last one
         self._open = self._over = False
-        self._sent = self._received = 0.0  # times on the monotonic clock
+        self.sent = self._received = 0.0
         self._pause = _PAUSE
         self._cancel = zenoh.CancellationToken()
 
@@ -101,7 +104,7 @@ class StateQuery:
         try:
             arrived = [self._arrived.get(timeout=self._patience())]
         except queue.Empty:
-            silent = monotonic() - max(self._received, self._sent) > _SILENCE
+            silent = monotonic() - max(self._received, self.sent) > _SILENCE
             if not self._open or (silent and published() > self._received):
                 self._send()
             return []
@@ -127,13 +130,13 @@ class StateQuery:
 
     def _patience(self) -> float:
         """Return how long to wait for a reply [s]."""
-        return _SILENCE if self._open else max(0.0, self._sent + self._pause - monotonic())
+        return _SILENCE / 2 if self._open else max(0.0, self.sent + self._pause - monotonic())
 
     def _send(self) -> None:
         """Send the query in place of an earlier one."""
         self._query = query = SealedQuery(self._anchor, self._key, about=self._about)
         self._pause = min(2 * self._pause, _MAX_PAUSE)
-        self._sent, self._open = monotonic(), True
+        self.sent, self._open = monotonic(), True
         # zenoh calls these functions: they must neither block nor use zenoh.
         handler: Any = zenoh.handlers.Callback(
             lambda reply: self._arrived.put((query, reply)), lambda: self._arrived.put((query, None))

@@ -15,6 +15,10 @@ from ....schemas.wire.answers import ContactsAnswers
 from ....schemas.wire.motion_messages import ContactCluster, ContactsReport, ProximityReport
 from ..world.frame import Frame, Run
 
+# Distances and margins are rounded to exact units of 15 nm. Below this difference, only a search
+# decides [m].
+_ROUNDING = 1e-7
+
 
 def make(effect: Proximity | Contacts, world: Any) -> Run:
     """Create an effect of a scene."""
@@ -25,6 +29,10 @@ def make(effect: Proximity | Contacts, world: Any) -> Run:
 
 def is_farther_than(frame: Frame, metres: float) -> bool:
     """Return whether the avatar's spheres are proved to be more than `metres` from those of the scan."""
+    known: ProximityReport | None = frame.reports.get("proximity")  # which runs before
+    distance = None if known is None or known.unknown else known.distance
+    if distance is not None and abs(distance - metres) > _ROUNDING:
+        return distance > metres
     answers = frame.world.distance(frame.body.avatar, frame.pose, metres, budget=frame.budget)
     return bool(answers.exact[0] and answers.signed_distance[0] == math.inf)
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
+from ..core.array_references import reference
 from .moving_avatar import MovingAvatar, make_moving
 from .sweep_segments import PlanSpace, SweepProgress, make_plan_space
 
@@ -29,25 +30,13 @@ class OneMotion(NamedTuple):
     pose: NDArray[np.float64]
 
 
-if nb.config.DISABLE_JIT:
+@reference
+class MotionScratch(NamedTuple):
+    """Reference to the scratch of an avatar's motions, see array_references.py."""
 
-    class MotionScratch(NamedTuple):
-        """Reference to the scratch of an avatar's motions, see array_references.py."""
-
-        moving: MovingAvatar
-        space: PlanSpace
-        one: OneMotion
-
-else:
-
-    @nb.structref.register
-    class _MotionScratchType(nb.types.StructRef):  # type: ignore[misc]
-        """numba's type of a `MotionScratch`."""
-
-    class MotionScratch(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Reference to the scratch of an avatar's motions, see array_references.py."""
-
-    nb.structref.define_proxy(MotionScratch, _MotionScratchType, ["moving", "space", "one"])
+    moving: MovingAvatar
+    space: PlanSpace
+    one: OneMotion
 
 
 @nb.njit(nogil=True, cache=True)

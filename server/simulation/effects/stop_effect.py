@@ -118,7 +118,7 @@ class StopRunner:
 
 def _walk_in(world: World) -> Callable[[Frame], None]:
     """Return the function that follows a motion command by the kernel `walk_frame`, compiled."""
-    from ..world.frame_walk import FOLLOW, walker_of
+    from ..world.walker import FOLLOW, walker_of
 
     walker = walker_of(world)
     walker.warm()

@@ -67,7 +67,7 @@ class World:
 
     file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
     is_alone: whether it is a single archive at the identity.
-    walker: see `walker_of` in frame_walk.py.
+    walker: see `walker_of` in walker.py.
     """
 
     walker: Any = None
@@ -312,27 +312,18 @@ class World:
         Return None too if a voxel within reach cannot be read, or is not in memory and the budget
         does not wait: the frame is then `unknown`.
         """
-        held = self._held
-        with self as archives:
-            each = archives[archive]
-            normals, pose = normals_of(each), each.placed.pose
-            place, way = touched_in_archive(each, cloud, toward[None])
-            waits = budget.late is None
-            try:
-                found: Vec | None = normals.at(place, way[0], reach, held.stop, waits=waits)
-                if found is None:
-                    farther = min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH)
-                    found = normals.at(place, way[0], farther, held.stop, waits=waits)
-            except CorruptError:
-                held.unknown = True
-                return None
-            except StoppedError:
-                if waits or held.stop:
-                    raise
-                budget.lacked(1)
-                held.unknown = True
-                return None
-            return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
+
+        def ask(normals: Any, place: Vec, ways: NDArray[np.float64], **how: Any) -> Vec | None:
+            found: Vec | None = normals.at(place, ways[0], reach, **how)
+            if found is None:
+                found = normals.at(place, ways[0], min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH), **how)
+            return found
+
+        found, pose = (
+            self._ask_surface(archive, cloud, toward[None], budget, ask),
+            self.archives[archive].pose,
+        )
+        return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
     def highest(
         self, hit: Hit, directions: NDArray[np.float64], reach: float, budget: QueryBudget = EXACT
@@ -343,24 +334,40 @@ class World:
         a voxel within reach is not in memory, or cannot be read.
         """
         assert hit.cloud is not None
+        found = self._ask_surface(
+            hit.archive, hit.cloud, directions, budget,
+            lambda normals, place, ways, **how: normals.highest(place, ways, reach, **how),
+        )  # fmt: skip
+        return np.zeros(len(directions)) if found is None else found
+
+    def _ask_surface(
+        self,
+        archive: int,
+        cloud: Vec,
+        ways: NDArray[np.float64],
+        budget: QueryBudget,
+        ask: Callable[..., NDArray[np.float64] | None],
+    ) -> NDArray[np.float64] | None:
+        """Return what `ask` says of the surface at a scan point; None if a voxel within reach is lacking.
+
+        cloud: (3,), ways: directions (k, 3), world.  ask: takes `Normals` and these in the archive's
+        frame.
+        """
         held, waits = self._held, budget.late is None
         with self as archives:
-            each = archives[hit.archive]
-            place, ways = touched_in_archive(each, hit.cloud, directions)
+            each = archives[archive]
+            place, inverse = each.placed.points_in(cloud[None])[0], each.placed.inverse
+            ways = ways if inverse is None else rotate_vectors(inverse, ways)
             try:
-                found: NDArray[np.float64] = normals_of(each).highest(
-                    place, ways, reach, held.stop, waits=waits
-                )
+                return ask(normals_of(each), place, ways, stop=held.stop, waits=waits)
             except CorruptError:
-                held.unknown = True
-                return np.zeros(len(directions))
+                pass
             except StoppedError:
                 if waits or held.stop:
                     raise
                 budget.lacked(1)
-                held.unknown = True
-                return np.zeros(len(directions))
-        return found
+            held.unknown = True
+            return None
 
 
 def normals_of(seen: HeldArchive) -> Any:
@@ -373,13 +380,3 @@ def normals_of(seen: HeldArchive) -> Any:
 
         normals = kept.setdefault("normals", Normals(seen.data, seen.opened.store.archive))
     return normals
-
-
-def touched_in_archive(
-    seen: HeldArchive, cloud: Vec, ways: NDArray[np.float64]
-) -> tuple[Vec, NDArray[np.float64]]:
-    """Return a scan point (3,) and directions (k, 3) of the world in an archive's frame."""
-    inverse = seen.placed.inverse
-    if inverse is None:
-        return cloud, ways
-    return transform_points(inverse, cloud[None])[0], rotate_vectors(inverse, ways)

@@ -11,6 +11,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.core.array_references import record_type
 from solidcloud.server.kernels.motion import sweep_resident
 from solidcloud.server.kernels.motion.motion_scratch import make_scratch
 from solidcloud.server.queries import resident_fast_path as module
@@ -26,15 +27,15 @@ def swept(data: SceneData, avatar: AvatarModel, first: Poses, last: Poses) -> li
     """What one kernel call says of each motion (k, 4, 4) with resident voxels, as `sweep` says it."""
     held, scratch, found = data.references.to(data.arrays, data.tree), make_scratch(avatar.arrays), []
     for begin, end in zip(first, last, strict=True):
-        result = np.empty(sweep_resident.COLUMNS)
+        result = np.zeros(1, record_type(*sweep_resident.SWEPT))[0]
         with data.residency.frozen():
             needed, verdict, visits, *_ = sweep_resident.sweep_resident(
                 begin, end, avatar.reference, scratch, data.radius_units, held.reference, data.arrays.stop,
                 data.nothing_clear, TOLERANCE, -1.0, result,
             )  # fmt: skip
         assert needed >= 0
-        witness = result[sweep_resident.AVATAR : sweep_resident.ENDED] if verdict == Verdict.CONTACT else []
-        found.append((verdict, visits, *result[: sweep_resident.SPEED], *witness))
+        witness = [*result["avatar"], *result["cloud"]] if verdict == Verdict.CONTACT else []
+        found.append((verdict, visits, result["lower"], result["upper"], *witness))
     return found
 
 

@@ -30,7 +30,7 @@ from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
-from .resident_fast_path import collide_fast, distance_fast
+from .resident_fast_path import collide_fast, distance_fast, sweep_fast
 from .sweep import sweep
 from .within import within
 
@@ -45,7 +45,7 @@ def _sweep(
     budget: QueryBudget,
 ) -> SweepAnswers:
     """Answer `sweep`, whose tolerance is also the length of its intervals."""
-    return sweep(data, avatar, pose_from, pose_to, margin, budget.tolerance, budget)
+    return sweep_fast(data, avatar, pose_from, pose_to, margin, budget.tolerance, budget)
 
 
 ENGINES: dict[str, Callable[..., Any]] = {
@@ -82,6 +82,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             collide(data, avatar, poses, 0.0, budget)
         if question.name == DISTANCE.name:
             distance(data, avatar, poses, 0.01, budget)
+        if question.name == SWEEP.name:
+            sweep(data, avatar, poses, poses, budget=budget)
         arguments = [
             samples[name] for name in question.arguments if name in question.required or name in samples
         ]

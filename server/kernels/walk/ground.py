@@ -65,7 +65,7 @@ LONGEST_FRAME = 0.1
 def old_plane(walk):
     """Return the point and the normal of the plane that the avatar stood on."""
     before = walk.memory.before[0]
-    return vector(before.plane_point), vector(before.plane_normal)
+    return vector(before.plane[0]), vector(before.plane[1])
 
 
 @nb.njit(nogil=True, cache=True)
@@ -96,8 +96,8 @@ def store_ground(walk, hit, normal, same):
         point, _ = old_plane(walk)
         place = minus(place, times(dot(minus(place, point), normal), normal))
     memory.state[0].has_plane = True
-    put(memory.state[0].plane_point, place)
-    put(memory.state[0].plane_normal, normal)
+    put(memory.state[0].plane[0], place)
+    put(memory.state[0].plane[1], normal)
 
 
 @nb.njit(nogil=True, cache=True)

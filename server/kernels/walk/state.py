@@ -71,20 +71,22 @@ QUESTION = record_type(
     ("toward", "f8", (3,)), ("directions", "f8", (3, 3)),
 )  # fmt: skip
 # What the body keeps from the frame before: duration of the frame [s], speed of falling [m/s], whether
-# the avatar stood, the plane that it stood on and the place where it was raised last, if they are known.
+# the avatar stood, point and normal of the plane that it stood on, and the place where it was raised last,
+# if they are known.
 BEFORE = record_type(
-    ("seconds", "f8"), ("fall_speed", "f8"), ("stood", "?"), ("has_plane", "?"), ("plane_point", "f8", (3,)),
-    ("plane_normal", "f8", (3,)), ("was_raised", "?"), ("raised_at", "f8", (3,)),
+    ("seconds", "f8"), ("fall_speed", "f8"), ("stood", "?"), ("has_plane", "?"), ("plane", "f8", (2, 3)),
+    ("was_raised", "?"), ("raised_at", "f8", (3,)),
 )  # fmt: skip
 # State: next row of the tape, part, number of hits, row of the hit that ended the motion command (-1:
 # none), verdict, whether the pose is known to be clear, what is left of the motion command [m], height
 # climbed by `step` [m] (NaN: none). Results of `ground`: whether it ran, whether the avatar stands, its
-# speed of falling [m/s], the normal of the ground, the plane that it stands on, and where it was raised.
+# speed of falling [m/s], the normal of the ground, point and normal of the plane that it stands on, and
+# where it was raised.
 STATE = record_type(
     ("row", "i8"), ("part", "i8"), ("hits", "i8"), ("blocked", "i8"), ("verdict", "i8"), ("clear", "?"),
     ("left", "f8", (3,)), ("stepped", "f8"), ("grounded", "?"), ("stands", "?"), ("fall_speed", "f8"),
-    ("has_ground", "?"), ("ground", "f8", (3,)), ("has_plane", "?"), ("plane_point", "f8", (3,)),
-    ("plane_normal", "f8", (3,)), ("raised", "?"), ("raised_at", "f8", (3,)),
+    ("has_ground", "?"), ("ground", "f8", (3,)), ("has_plane", "?"), ("plane", "f8", (2, 3)),
+    ("raised", "?"), ("raised_at", "f8", (3,)),
 )  # fmt: skip
 # A recorded hit: its row, and its normal if that was estimated.
 HIT = record_type(("row", "i8"), ("has_normal", "?"), ("normal", "f8", (3,)))

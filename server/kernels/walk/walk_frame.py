@@ -3,7 +3,6 @@
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..motion.motion_scratch import make_scratch
 from .ground import stand_on_ground
 from .motions import follow_command
 from .slide import slide_command
@@ -14,8 +13,8 @@ from .walk_vectors import copy_pose
 
 @nb.njit(nogil=True, cache=True)
 def walk_frame(
-    parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, memory, held, stop,
-    unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares, bounds,
+    parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, scratch, memory, held,
+    stop, unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares, bounds,
     kinds, bounds_origin, wanted, own, margin,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
@@ -24,7 +23,7 @@ def walk_frame(
     `clear` are those of the first call.  begin, target, pose: (4, 4), where the frame began, the commanded
     pose, and the pose reached.  seconds: duration of the frame.  fell: speed of falling [m/s].
     stood: whether the avatar stood.  verdict: of the frame.  clear: whether `pose` is known to be clear.
-    settings, memory: see state.py.  avatar: reference to its arrays.
+    settings, memory: see state.py.  avatar: reference to its arrays.  scratch: of its motions.
     held: reference to the scene's arrays.  stop, unknown_everywhere, other_units: as for
     `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
     may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
@@ -34,7 +33,7 @@ def walk_frame(
     `find_near_bodies`.  margin: distance to keep from them [m].
     """
     walk = Walk(
-        settings, avatar, make_scratch(avatar.avatar), memory, held, stop, unknown_everywhere, alone, native, bodies,
+        settings, avatar, scratch, memory, held, stop, unknown_everywhere, alone, native, bodies,
         other_units, least_tolerance, tolerance_units, squares, bounds, kinds, bounds_origin, wanted,
         own, margin,
     )  # fmt: skip

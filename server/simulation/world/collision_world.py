@@ -32,8 +32,7 @@ from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import pose_between
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
-from ...queries.resident_fast_path import collide_fast, distance_fast, has_unknown
-from ...queries.sweep import sweep
+from ...queries.resident_fast_path import collide_fast, distance_fast, has_unknown, sweep_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
@@ -48,6 +47,7 @@ _NO_ORIGIN = np.zeros(3)
 SPARSE_FACTOR = 3.0
 # `Verdict` of its number: making one takes as long as a fifth of a query.
 _VERDICTS = {int(verdict): verdict for verdict in Verdict}
+_CLEAR, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.UNKNOWN)
 
 
 class _Held(threading.local):
@@ -158,19 +158,26 @@ class World:
 
         ask: queries an archive, in its frame.  same: columns whose first value tells that archive.
         """
-        with self as held:
-            found = ask_held(held, ask)
-        answers, number = merge_answers(found), 0
-        if len(found) > 1 and same:
-            named = [
-                b"".join(getattr(each, name)[:1].tobytes() for name in same) for each in (answers, *found)
-            ]
-            number = named.index(named[0], 1) - 1
-        verdict = answers.verdict[0]
-        if not (isinstance(answers, SweepAnswers) and verdict == Verdict.CLEAR):  # proved without them
+        held, number = self._held, 0
+        if self.is_alone and held.depth:  # nothing to transform or to merge
+            answers: Any = ask(held.archives[0])
+        else:
+            with self as archives:
+                found: list[Any] = ask_held(archives, ask)
+            answers = merge_answers(found)
+            if len(found) > 1 and same:
+                named = [
+                    b"".join([getattr(each, name)[:1].tobytes() for name in same])
+                    for each in (answers, *found)
+                ]
+                number = named.index(named[0], 1) - 1
+        verdict, missing = answers.verdict.item(0), answers.voxels_missing.item(0)
+        # A motion that the level of detail proves clear lacks nothing.
+        if answers.late and not (isinstance(answers, SweepAnswers) and verdict == _CLEAR):
             budget.lacked(len(answers.late))
-        missing = 0 if isinstance(answers, CollideAnswers) else int(answers.voxels_missing[0])
-        self.count(int(answers.node_visits[0]), missing or verdict == Verdict.UNKNOWN)
+        held.visits += answers.node_visits.item(0)
+        if verdict == _UNKNOWN or (missing and not isinstance(answers, CollideAnswers)):
+            held.unknown = True
         return answers, number
 
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
@@ -179,7 +186,7 @@ class World:
         answers, _ = self._ask(
             budget, lambda each: collide_fast(each.data, avatar, each.placed.poses_in(poses), 0.0, budget)
         )
-        return _VERDICTS[int(answers.verdict[0])]
+        return _VERDICTS[answers.verdict.item(0)]
 
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
@@ -205,11 +212,10 @@ class World:
 
     def _contacts(self, avatar: AvatarModel, pose: Pose, *how: Any) -> tuple[ContactsAnswers, int]:
         """Return the contacts at a pose, and the archive of the deepest one. how: as for `contacts`."""
-        *given, budget = how
         poses = pose[None]
         return self._ask(
-            budget,
-            lambda each: contacts(each.data, avatar, each.placed.poses_in(poses), *given, budget),
+            how[-1],
+            lambda each: contacts(each.data, avatar, each.placed.poses_in(poses), *how),
             "signed_distance",
             "cloud_point",
             "avatar_point",
@@ -233,7 +239,7 @@ class World:
         )
         if found.distance[0] == np.inf:
             return None
-        return Hit(0.0, _VERDICTS[int(found.verdict[0])], None, found.cloud_point[0], "", number)
+        return Hit(0.0, _VERDICTS[found.verdict.item(0)], None, found.cloud_point[0], "", number)
 
     def sweep(
         self,
@@ -250,7 +256,7 @@ class World:
         first, last = pose_from[None], pose_to[None]
         found, number = self._ask(
             budget,
-            lambda each: sweep(
+            lambda each: sweep_fast(
                 each.data,
                 avatar,
                 each.placed.poses_in(first),
@@ -263,13 +269,13 @@ class World:
             "witness_cloud",
             "witness_avatar",
         )
-        verdict, exact = _VERDICTS[int(found.verdict[0])], bool(found.exact[0])
+        verdict, exact = _VERDICTS[found.verdict.item(0)], found.exact.item(0)
         if not exact:
             with self as held:  # a stop may leave places unexamined too
                 self.count(0, bool(budget.stop) or any(has_unknown(each.data) for each in held))
         if verdict == Verdict.CLEAR:
             return None
-        lower, upper = float(found.lower[0]), float(found.upper[0])
+        lower, upper = found.lower.item(0), found.upper.item(0)
         if verdict == Verdict.UNKNOWN:
             return Hit(lower, verdict, None, None, exact=exact)
         return Hit(

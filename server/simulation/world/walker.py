@@ -6,8 +6,8 @@ archive at the identity, or an avatar is too large (kernels/walk/state.py).
 
 import math
 import threading
-from collections import namedtuple
 from contextlib import nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,10 @@ from ....schemas.scene.effect_table import Ground, Slide, Step, Stop, Sweep
 from ....schemas.scene.scene_file import SceneFile, sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
+from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.array_references import Held
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
+from ...kernels.motion.motion_scratch import make_scratch
 from ...kernels.walk import state
 from ...kernels.walk.slide import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
@@ -55,6 +57,9 @@ _ROUNDING = 0.005
 # Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
 # on, (6,), and the place where it was raised last, (3,).
 GROUND_PLANE, RAISED = "ground", "ground raised"
+# This many consecutive frames in the same voxels count as one use of them: recording one takes a tenth
+# of a query.
+_FRAMES_PER_USE = 16
 # Rows of the tape at first; frames that need more double it.
 _ROWS = 64
 # A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
@@ -63,8 +68,9 @@ _FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
 _VERDICTS = {int(verdict): verdict for verdict in Verdict}
 
 
-_State: Any = namedtuple("_State", state.STATE.names or ())
-_Log: Any = namedtuple("_Log", state.LOG.names or ())
+def _fields_of(records: NDArray[np.void]) -> Any:
+    """Return an object with the fields of records, as arrays: Python reads these faster than a record."""
+    return SimpleNamespace(**{name: records[name] for name in records.dtype.names or ()})
 
 
 def _settings(file: SceneFile, up: Vec) -> NDArray[np.void]:
@@ -104,14 +110,36 @@ _NO_BODIES: Any = _NoBodies()
 
 
 class FrameMemory(threading.local):
-    """State of a frame of each thread."""
+    """State of a frame of each thread.
+
+    memory: its arrays.  reference: to them, for the kernel.  tape, log, question, before, state, hits:
+    the fields of each record of them.
+    """
 
     def __init__(self) -> None:
-        self.use(state.make_arrays(_ROWS))
+        self._take(state.make_arrays(_ROWS))
+        self._scratch: tuple[Any, Any] = (None, None)  # the last avatar's arrays, and theirs
+        self._used: list[int] = []
+        self._again = 0
 
-    def use(self, memory: state.WalkArrays) -> None:
+    def scratch_of(self, avatar: AvatarModel) -> Any:
+        """Return the scratch of an avatar's motions, kept until another avatar moves."""
+        if self._scratch[0] is not avatar.arrays:
+            self._scratch = avatar.arrays, make_scratch(avatar.arrays)
+        return self._scratch[1]
+
+    def use_voxels(self, residency: Any, rows: list[int]) -> None:
+        """Record a use of voxels, once for _FRAMES_PER_USE consecutive frames in the same voxels."""
+        if rows != self._used or not self._again:
+            residency.use(rows)
+            self._used, self._again = rows, _FRAMES_PER_USE
+        self._again -= 1
+
+    def _take(self, memory: state.WalkArrays) -> None:
         """Take other arrays."""
         self.memory, self.reference = memory, state.refer_to_memory(memory)
+        self.tape, self.log, self.question = map(_fields_of, (memory.tape, memory.log, memory.question))
+        self.before, self.state, self.hits = map(_fields_of, (memory.before, memory.state, memory.hits))
 
     def grow(self) -> None:
         """Double the rows of the tape."""
@@ -120,7 +148,7 @@ class FrameMemory(threading.local):
         for name in state.WalkArrays._fields:
             part: NDArray[np.float64] = getattr(old, name)
             getattr(larger, name)[: len(part)] = part
-        self.use(larger)
+        self._take(larger)
 
 
 class WalkCall:
@@ -134,109 +162,107 @@ class WalkCall:
 
     def begin(self) -> None:
         """Write what the body keeps between frames, and the hits before the first part."""
-        body, memory = self._frame.body, self._thread.memory
-        plane, raised, before = (
-            body.effect_state.get(GROUND_PLANE),
-            body.effect_state.get(RAISED),
-            memory.before,
-        )
-        before["has_plane"], before["was_raised"] = plane is not None, raised is not None
+        kept, before = self._frame.body.effect_state, self._thread.before
+        plane, raised = kept.get(GROUND_PLANE), kept.get(RAISED)
+        before.has_plane[0], before.was_raised[0] = plane is not None, raised is not None
         if plane is not None:
-            before["plane_point"], before["plane_normal"] = plane[:3], plane[3:]
+            before.plane[0] = plane.reshape(2, 3)
         if raised is not None:
-            before["raised_at"] = raised
+            before.raised_at[0] = raised
         for row, hit in enumerate(self._frame.hits):
             self._write_hit(row, hit)
-        memory.log["known"] = len(self._frame.hits)
+        self._thread.log.known[0] = len(self._frame.hits)
 
     def finish(self) -> None:
         """Read the state that a frame has reached."""
-        frame, memory = self._frame, self._thread.memory
-        now = _State(*memory.state[0].item())
-        frame.pose = memory.poses[0].copy()
-        frame.verdict, frame.clear, frame.remaining = _VERDICTS[now.verdict], now.clear, now.left.copy()
-        frame.hits = [self._read_hit(hit) for hit in memory.hits[: now.hits]]
-        if not math.isnan(now.stepped):
-            frame.reports["stepped"] = now.stepped
-        if not now.grounded:
+        frame, now = self._frame, self._thread.state
+        frame.pose = self._thread.memory.poses[0].copy()
+        frame.verdict, frame.clear = _VERDICTS[now.verdict.item()], now.clear.item()
+        frame.remaining = now.left[0].copy()
+        frame.hits = [self._read_hit(number) for number in range(now.hits.item())]
+        stepped = now.stepped.item()
+        if not math.isnan(stepped):
+            frame.reports["stepped"] = stepped
+        if not now.grounded.item():
             return
-        frame.on_ground, frame.fall_speed = now.stands, now.fall_speed
-        x, y, z = now.ground.tolist()
-        frame.reports["ground"] = GroundReport(
-            now.stands, now.fall_speed, (x, y, z) if now.has_ground else None
-        )
-        if now.has_plane:
-            frame.effect_state[GROUND_PLANE] = np.concatenate([now.plane_point, now.plane_normal])
-        if now.raised:
-            frame.effect_state[RAISED] = now.raised_at.copy()
+        frame.on_ground, frame.fall_speed = now.stands.item(), now.fall_speed.item()
+        normal = tuple(now.ground[0].tolist()) if now.has_ground.item() else None
+        frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
+        if now.has_plane.item():
+            frame.effect_state[GROUND_PLANE] = now.plane[0].flatten()
+        if now.raised.item():
+            frame.effect_state[RAISED] = now.raised_at[0].copy()
 
     def answer(self) -> None:
         """Answer the query that the kernel asked."""
-        memory, frame = self._thread.memory, self._frame
-        query, row = int(memory.log["asked"][0]), int(memory.log["known"][0])
+        thread, frame = self._thread, self._frame
+        query, row = thread.log.asked.item(), thread.log.known.item()
         if query == state.FULL:
-            self._thread.grow()
+            thread.grow()
             return
-        before, frame.pose = frame.pose, memory.asked_poses[0].copy()
+        poses = thread.memory.asked_poses.copy()
+        before, frame.pose = frame.pose, poses[0]
         try:
-            self._answer(query, row, memory.question[0], memory.asked_poses[1].copy())
+            self._answer(query, row, poses[1])
         finally:
             frame.pose = before
-        memory.log["known"] = row + 1
+        thread.log.known[0] = row + 1
 
-    def _answer(self, query: int, row: int, question: Any, to: Pose) -> None:
-        """Write the answer of a query to its row. question: its `QUESTION`.  to: end of its motion."""
-        frame, result = self._frame, self._thread.memory.tape[row]
-        world, pose, tolerance, below = frame.world, frame.pose, question["tolerance"], question["below"]
+    def _answer(self, query: int, row: int, to: Pose) -> None:
+        """Write the answer of a query to its row. to: end of its motion."""
+        frame, tape, question = self._frame, self._thread.tape, self._thread.question
+        world, pose, tolerance, below = (
+            frame.world,
+            frame.pose,
+            question.tolerance.item(),
+            question.below.item(),
+        )
+        place, level, archive = question.place[0].copy(), question.level.item(), question.archive.item()
         if query == state.SWEPT_TO:
-            self._write_hit(row, find_first_hit(frame, to, tolerance, question["skin"], below=below))
+            self._write_hit(row, find_first_hit(frame, to, tolerance, question.skin.item(), below=below))
         elif query == state.BODIES_SWEPT:
-            until = math.inf if result["verdict"] == int(Verdict.CLEAR) else result["lower"]
+            until = math.inf if tape.verdict[row] == int(Verdict.CLEAR) else tape.lower.item(row)
             hit = first_body_hit(frame, to, tolerance, until, below=below)
             if hit is not None:
                 self._write_hit(row, hit)
         elif query == state.CLEAR_AT:
-            result["answer"] = is_clear(frame, pose, proved=question["proved"])
+            tape.answer[row] = is_clear(frame, pose, proved=question.proved.item())
         elif query == state.BODIES_AT:
-            result["answer"] = not touches_bodies(frame, pose)
+            tape.answer[row] = not touches_bodies(frame, pose)
         elif query == state.TOUCHED:
             self._write_hit(row, find_touched(frame, pose))
         elif query == state.GIVES_WAY:
-            hit = self._hits[int(question["hit"])]
-            result["answer"] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
+            hit = self._hits[question.hit.item()]
+            tape.answer[row] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
         elif query == state.NORMAL_AT:
-            normal = world.normal_at(
-                question["archive"], question["place"].copy(), question["toward"].copy(),
-                self._reaches[question["level"]], frame.budget,
-            )  # fmt: skip
-            result["has_normal"] = normal is not None
+            toward, reach = question.toward[0].copy(), self._reaches[level]
+            normal = world.normal_at(archive, place, toward, reach, frame.budget)
+            tape.has_normal[row] = normal is not None
             if normal is not None:
-                result["normal"] = normal
+                tape.normal[row] = normal
         elif query == state.HIGHEST:
-            touched = Hit(
-                0.0, Verdict.CONTACT, None, question["place"].copy(), archive=int(question["archive"])
-            )
-            directions, reach = question["directions"][: question["count"]], self._reaches[question["level"]]
-            heights = world.highest(touched, directions, reach, frame.budget)
-            result["heights"] = 0.0
-            result["heights"][: len(heights)] = heights
+            touched = Hit(0.0, Verdict.CONTACT, None, place, archive=archive)
+            directions = question.directions[0, : question.count.item()].copy()
+            heights = world.highest(touched, directions, self._reaches[level], frame.budget)
+            tape.heights[row] = 0.0
+            tape.heights[row, : len(heights)] = heights
         elif query == state.NEAREST:
-            found = world.nearest(question["place"].copy(), float(question["reach"]), frame.budget)
-            result["has_pair"] = found is not None
+            found = world.nearest(place, question.reach.item(), frame.budget)
+            tape.has_pair[row] = found is not None
             if found is not None:
-                result["cloud"], result["archive"] = found.cloud, found.archive
+                tape.cloud[row], tape.archive[row] = found.cloud, found.archive
         else:
             assert query == state.LANDS
-            self._write_landing(row, question["reach"], stood=question["stood"])
+            self._write_landing(row, question.reach.item(), stood=question.stood.item())
 
     def _write_landing(self, row: int, reach: float, *, stood: bool) -> None:
         """Write whether an avatar without ground within `reach` [m] of its feet may land.
 
         stood: whether it stood in the last frame.
         """
-        frame, result = self._frame, self._thread.memory.tape[row]
+        frame, tape = self._frame, self._thread.tape
         world, avatar, up = frame.world, frame.body.avatar, frame.world.up
-        result["answer"], result["unloaded"], result["rest"] = False, False, 0.0
+        self._write_hit(row, None)  # the kernel may record it as a hit
         if not len(avatar.points):
             return
         feet = lowest_height(avatar, frame.pose, up)
@@ -249,50 +275,52 @@ class WalkCall:
         )
         touches = swept is not None and swept.verdict == Verdict.CONTACT
         if frame.lacked > lacked and not (touches and swept.exact):
-            result["unloaded"] = True
+            tape.unloaded[row] = True
         elif not touches:
-            result["answer"] = swept is not None
+            tape.answer[row] = swept is not None
         else:
             # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
-            result["answer"] = not stood or dot(swept.cloud, up) < feet - reach
+            tape.answer[row] = not stood or dot(swept.cloud, up) < feet - reach
 
     def _write_hit(self, row: int, hit: Hit | None) -> None:
         """Write a hit, or None, to a row."""
-        tape = self._thread.memory.tape
-        tape[row] = np.zeros((), tape.dtype)
-        result = tape[row]
+        records, tape = self._thread.memory.tape, self._thread.tape
+        records[row] = np.zeros((), records.dtype)
         if hit is None:
-            result["verdict"] = int(Verdict.CLEAR)
+            tape.verdict[row] = int(Verdict.CLEAR)
             return
         self._hits[row] = hit
-        result["lower"], result["verdict"], result["archive"] = hit.fraction, int(hit.verdict), hit.archive
-        result["unloaded"], result["rest"], result["named"] = hit.unloaded, hit.rest, bool(hit.what)
-        for name, part in (("normal", hit.normal), ("point", hit.point), ("end", hit.end)):
-            if part is not None:
-                result[f"has_{name}"], result[name] = True, part
+        tape.lower[row], tape.verdict[row], tape.archive[row] = hit.fraction, int(hit.verdict), hit.archive
+        tape.unloaded[row], tape.rest[row], tape.named[row] = hit.unloaded, hit.rest, bool(hit.what)
+        if hit.normal is not None:
+            tape.has_normal[row], tape.normal[row] = True, hit.normal
+        if hit.point is not None:
+            tape.has_point[row], tape.point[row] = True, hit.point
+        if hit.end is not None:
+            tape.has_end[row], tape.end[row] = True, hit.end
         if hit.avatar is not None and hit.cloud is not None:
-            result["has_pair"], result["avatar"], result["cloud"] = True, hit.avatar, hit.cloud
+            tape.has_pair[row], tape.avatar[row], tape.cloud[row] = True, hit.avatar, hit.cloud
 
-    def _read_hit(self, recorded: Any) -> Hit:
-        """Return a recorded hit, a `HIT`."""
-        row = int(recorded["row"])
-        result, normal = self._thread.memory.tape[row], None
-        if recorded["has_normal"]:
-            normal = recorded["normal"].copy()
-        elif result["has_normal"]:
-            normal = result["normal"].copy()
-        known, has_pair = self._hits.get(row), result["has_pair"]
+    def _read_hit(self, number: int) -> Hit:
+        """Return a recorded hit."""
+        hits, tape = self._thread.hits, self._thread.tape
+        row, normal = hits.row.item(number), None
+        if hits.has_normal.item(number):
+            normal = hits.normal[number].copy()
+        elif tape.has_normal.item(row):
+            normal = tape.normal[row].copy()
+        known, has_pair = self._hits.get(row), tape.has_pair.item(row)
         return Hit(
-            float(result["lower"]),
-            _VERDICTS[int(result["verdict"])],
-            result["avatar"].copy() if has_pair else None,
-            result["cloud"].copy() if has_pair else None,
+            tape.lower.item(row),
+            _VERDICTS[tape.verdict.item(row)],
+            tape.avatar[row].copy() if has_pair else None,
+            tape.cloud[row].copy() if has_pair else None,
             "" if known is None else known.what,
-            int(result["archive"]),
+            tape.archive.item(row),
             normal,
-            result["point"].copy() if result["has_point"] else None,
-            bool(result["unloaded"]),
-            float(result["rest"]),
+            tape.point[row].copy() if tape.has_point.item(row) else None,
+            tape.unloaded.item(row),
+            tape.rest.item(row),
         )
 
 
@@ -335,35 +363,35 @@ class Walker:
             wanted |= obstacle.wanted
         with world as seen:
             each, alone, avatar = seen[0], world.is_alone, body.avatar
-            data, residency = each.data, each.data.residency
+            data, residency, scratch = each.data, each.data.residency, thread.scratch_of(avatar)
             native = self.native and alone and 0 < len(avatar.points) <= MAX_FAST_POINTS
             squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
             held = data.references.to(data.arrays, data.tree)
-            thread.memory.log["repeats"] = False
+            thread.log.repeats[0] = False
             while True:
                 try:
                     # The bodies' lock comes first, as where an object is pushed through the scan.
                     with bodies.lock, residency.frozen():
                         self._code.call(
                             walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
-                            self._settings, avatar.reference, thread.reference, held.reference, data.arrays.stop,
-                            data.nothing_clear, alone, native, blocks, data.radius_units, tolerance,
+                            self._settings, avatar.reference, scratch, thread.reference, held.reference,
+                            data.arrays.stop, data.nothing_clear, alone, native, blocks, data.radius_units, tolerance,
                             budget.tolerance_units, squares, bodies.bounds, bodies.kinds, bodies.origin, wanted,
                             bodies.row_of(body.name, user=True),
                             max([each.margin for each in frame.obstacles], default=0.0),
                         )  # fmt: skip
-                        log = _Log(*thread.memory.log[0].item())
-                        if log.used:
-                            rows = thread.memory.used[: log.used]
-                            if log.repeats:  # answering a query may have evicted some of them
+                        log, used = thread.log, thread.log.used.item()
+                        if used:
+                            rows = thread.memory.used[:used]
+                            if log.repeats.item():  # answering a query may have evicted some of them
                                 rows = rows[data.arrays.where[rows, 0] >= 0]
-                            residency.use(rows.tolist())
+                            thread.use_voxels(residency, rows.tolist())
                     break
                 except state.AskedError:
                     call.answer()
-                    thread.memory.log["repeats"] = True
-        frame.visits, frame.apart = log.visits.tolist(), log.apart > 0
-        world.count(sum(frame.visits), log.missed)
+                    thread.log.repeats[0] = True
+        frame.visits, frame.apart = log.visits[0].tolist(), log.apart.item() > 0
+        world.count(sum(frame.visits), log.missed.item())
         call.finish()
         if frame.verdict == Verdict.CONTACT and not frame.clear:  # it began in contact
             frame.verdict = world.collide(body.avatar, frame.pose, budget)

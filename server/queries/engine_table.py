@@ -27,7 +27,7 @@ from .distance import distance
 from .objects import objects
 from .raycast import raycast
 from .request import EXACT, QueryBudget
-from .resident_fast_path import collide_fast, distance_fast
+from .resident_fast_path import collide_fast, distance_fast, sweep_fast
 from .scene_data import SceneData
 from .sweep import sweep
 from .within import within
@@ -36,7 +36,7 @@ ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,
     DISTANCE.name: distance_fast,
     CONTACTS.name: contacts,
-    SWEEP.name: sweep,
+    SWEEP.name: sweep_fast,
     RAYCAST.name: raycast,
     WITHIN.name: within,
     OBJECTS.name: objects,
@@ -66,6 +66,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             collide(data, avatar, poses, 0.0, budget)
         if question.name == DISTANCE.name:
             distance(data, avatar, poses, 0.01, budget)
+        if question.name == SWEEP.name:
+            sweep(data, avatar, poses, poses, budget=budget)
         arguments = [
             samples[name] for name in question.arguments if name in question.required or name in samples
         ]

@@ -70,7 +70,7 @@ HELPERS = {
     "server.simulation.world.body_obstacles": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},
     "server.queries.surface_normals": {"slide", "ground", "step"},
-    "server.simulation.world.frame_walk": MOVING,
+    "server.simulation.world.walker": MOVING,
     "server.kernels.walk.walk_frame": MOVING,
     "server.kernels.rays.surface": MOVING,
 }

@@ -102,15 +102,14 @@ def bound_body(box, pose, origin, more, bounds):
 
 
 @nb.njit(nogil=True, cache=True)
-def find_near_bodies(box, first, last, more, bounds, kinds, wanted, skip, rows):
+def find_near_bodies(box, first, last, origin, more, bounds, kinds, wanted, skip, rows):
     """Write the bodies whose bounds meet those of a motion, ascending, to rows (n,) int64.
 
     Returns how many.
-    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations relative to the origin.
+    box: (2, 3) of the moving avatar.  first, last: (4, 4), world.  origin: (3,), that of the bounds.
     more: its radius plus the margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8,
     one bit each.  wanted: the bits of the kinds to find.  skip: a row to omit.
     """
-    origin = np.zeros(3)
     begin, end = np.empty((2, 3)), np.empty((2, 3))
     stray = make_motion(first, last, box, origin).bend / 8.0
     bound_body(box, first, origin, more + stray, begin)

@@ -5,7 +5,8 @@ which takes longer than most searches (scripts/bench_walk). A reference is one o
 holds them for compiled code: it is taken apart once, when it is made.
 """
 
-from typing import Any, NamedTuple
+import sys
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,45 +17,44 @@ from .reach import VoxelTree
 from .scene_arrays import SceneArrays
 from .voxels_in_reach import OneReach, make_one_reach
 
-if nb.config.DISABLE_JIT:
+_Fields = TypeVar("_Fields", bound=type)
 
-    class SceneReference(NamedTuple):
-        """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
 
-        scene: SceneArrays
-        tree: VoxelTree
-        one: OneReach
+def reference(fields: _Fields) -> _Fields:
+    """Turn a named tuple into references with its fields, at the top of a module.
 
-    class AvatarReference(NamedTuple):
-        """Arrays of an avatar, see `refer_to_avatar`."""
+    Kernels read the fields by name. Only compiled code makes a reference.
+    """
+    if nb.config.DISABLE_JIT:
+        return fields
+    name, module = fields.__name__, fields.__module__
+    # Stored kernels name numba's type by module and name.
+    numba_type = type(f"_{name}Type", (nb.types.StructRef,), {"__module__": module})
+    setattr(sys.modules[module], numba_type.__name__, nb.structref.register(numba_type))
+    found: Any = type(name, (nb.structref.StructRefProxy,), {"__module__": module, "__doc__": fields.__doc__})
+    nb.structref.define_proxy(found, numba_type, list(fields._fields))  # type: ignore[attr-defined]
+    return found  # type: ignore[no-any-return]
 
-        avatar: Avatar
-        rows: NDArray[np.int32]
-        surface: int
-        points: NDArray[np.float64]
-        radius: float
-        box: NDArray[np.float64]
 
-else:
+@reference
+class SceneReference(NamedTuple):
+    """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
 
-    @nb.structref.register
-    class _SceneReferenceType(nb.types.StructRef):  # type: ignore[misc]
-        """numba's type of a `SceneReference`."""
+    scene: SceneArrays
+    tree: VoxelTree
+    one: OneReach
 
-    @nb.structref.register
-    class _AvatarReferenceType(nb.types.StructRef):  # type: ignore[misc]
-        """numba's type of an `AvatarReference`."""
 
-    class SceneReference(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
+@reference
+class AvatarReference(NamedTuple):
+    """Arrays of an avatar, see `refer_to_avatar`."""
 
-    class AvatarReference(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Arrays of an avatar, see `refer_to_avatar`."""
-
-    nb.structref.define_proxy(SceneReference, _SceneReferenceType, ["scene", "tree", "one"])
-    nb.structref.define_proxy(
-        AvatarReference, _AvatarReferenceType, ["avatar", "rows", "surface", "points", "radius", "box"]
-    )
+    avatar: Avatar
+    rows: NDArray[np.int32]
+    surface: int
+    points: NDArray[np.float64]
+    radius: float
+    box: NDArray[np.float64]
 
 
 @nb.njit(nogil=True, cache=True)
@@ -81,6 +81,12 @@ def with_flag(scene, stop):
         scene.words, scene.ints, scene.halves, scene.where, scene.corners, scene.origin, scene.step,
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
+
+
+def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    """Return the type of records whose fields kernels read by name. fields: as of a structured dtype."""
+    found = np.dtype(list(fields), align=True)
+    return np.dtype((np.record, found)) if nb.config.DISABLE_JIT else found
 
 
 class Held:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
+from ..core.array_references import reference
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.reach import all_resident
 from ..core.scene_arrays import SceneArrays, stopped
@@ -36,12 +37,15 @@ _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdi
 
 # Result of `sweep_resident` for a motion that it does not answer.
 _NOT_ANSWERED = (-1, _UNKNOWN, 0, 0, 0)
-# Columns of the output: fractions, upper bound of the distance any point moves [m], the witness's
+# Fields of the output: fractions, upper bound of the distance any point moves [m], the witness's
 # centres, world [m]; with a skin, how the motion ends (below), the touching point, avatar frame [m],
-# and the 16 values of the pose at which it ends, world.
-LOWER, UPPER, SPEED, AVATAR, CLOUD, ENDED, POINT, END, COLUMNS = 0, 1, 2, 3, 6, 9, 10, 13, 29
+# and the pose at which it ends, world.
+SWEPT = (
+    ("lower", "f8"), ("upper", "f8"), ("speed", "f8"), ("avatar", "f8", (3,)), ("cloud", "f8", (3,)),
+    ("ended", "i8"), ("point", "f8", (3,)), ("end", "f8", (4, 4)),
+)  # fmt: skip
 # How a motion ends: not known, or the pose may touch; where it began; at a pose that is proved clear.
-OPEN, STAYS, PROVED = 0.0, 1.0, 2.0
+OPEN, STAYS, PROVED = 0, 1, 2
 # Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
 # `lower`.
 MIN_MOTION = 2e-5
@@ -72,25 +76,13 @@ class OneMotion(NamedTuple):
     pose: NDArray[np.float64]
 
 
-if nb.config.DISABLE_JIT:
+@reference
+class MotionScratch(NamedTuple):
+    """Reference to the scratch of an avatar's motions, see array_references.py."""
 
-    class MotionScratch(NamedTuple):
-        """Reference to the scratch of an avatar's motions, see array_references.py."""
-
-        moving: MovingAvatar
-        space: PlanSpace
-        one: OneMotion
-
-else:
-
-    @nb.structref.register
-    class _MotionScratchType(nb.types.StructRef):  # type: ignore[misc]
-        """numba's type of a `MotionScratch`."""
-
-    class MotionScratch(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Reference to the scratch of an avatar's motions, see array_references.py."""
-
-    nb.structref.define_proxy(MotionScratch, _MotionScratchType, ["moving", "space", "one"])
+    moving: MovingAvatar
+    space: PlanSpace
+    one: OneMotion
 
 
 @nb.njit(nogil=True, cache=True)
@@ -188,8 +180,8 @@ def sweep_resident(
     request's stop flag.  other_units, tolerance: as in kernels/motion/sweep_advance.py.  The
     dataset's origin is subtracted from the motion as in server/queries/sweep.py.  skin: distance to
     keep from what is touched [m]; negative: the end of the motion is not computed.
-    Writes held.one, the voxels in reach, and result (COLUMNS,) float64; the witness is written where
-    the verdict is CONTACT.
+    Writes held.one, the voxels in reach, and result, a record with the fields SWEPT; the witness is
+    written where the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
@@ -237,13 +229,13 @@ def sweep_resident(
         find_unknown_regions(box, first, last, avatar, units, from_zero, tree, until, outside, unknown_from)
         if unknown_from[0] <= until[0]:
             proved = min(proved, unknown_from[0])
-    result[LOWER], result[UPPER], result[SPEED], result[ENDED] = proved, upper, progress.speed[0], OPEN
+    result.lower, result.upper, result.speed, result.ended = proved, upper, progress.speed[0], OPEN
     verdict = _CLEAR if proved >= 1.0 else _UNKNOWN
     if upper < np.inf:
         verdict = _CONTACT
         for r in range(3):
-            result[AVATAR + r] = progress.witness[0, 0, r] + origin[r]
-            result[CLOUD + r] = progress.witness[0, 1, r] + origin[r]
+            result.avatar[r] = progress.witness[0, 0, r] + origin[r]
+            result.cloud[r] = progress.witness[0, 1, r] + origin[r]
         if skin >= 0.0:
             _end_motion(pose_from, pose_to, box, avatar, origin, proved, skin, one, result)
     return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])
@@ -257,19 +249,18 @@ def _end_motion(pose_from, pose_to, box, avatar, origin, lower, skin, one, resul
     """
     motion = make_motion(one.first[0], one.last[0], box, one.origin)
     _write_pose(motion, min(lower, 1.0), origin, one.pose)
-    point = result[POINT : POINT + 3]
-    write_point(one.pose, result[AVATAR : AVATAR + 3], point)
+    own, cloud, point = result.avatar, result.cloud, result.point
+    write_point(one.pose, own, point)
     way = longest_way(pose_from, pose_to, avatar)
-    own, cloud = result[AVATAR : AVATAR + 3], result[CLOUD : CLOUD + 3]
     fraction = lower - skin_fraction(pose_from, pose_to, own, cloud, point, way, skin)
     if not fraction * way >= MIN_MOTION:
-        result[ENDED] = STAYS
+        result.ended = STAYS
         return
     if fraction < lower and _write_pose(motion, fraction, origin, one.pose):
-        result[ENDED] = PROVED
+        result.ended = PROVED
         for r in range(4):
             for c in range(4):
-                result[END + 4 * r + c] = one.pose[r, c]
+                result.end[r, c] = one.pose[r, c]
 
 
 @njit_no_refcount

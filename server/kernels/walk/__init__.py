@@ -2,5 +2,5 @@
 
 May import server.kernels.bodies, server.kernels.collide, server.kernels.core, server.kernels.motion,
 server.kernels.rays, schemas.
-Begin with walk_state.py.
+Begin with state.py.
 """

@@ -19,6 +19,12 @@ def vector(row):
 
 
 @njit_no_refcount
+def put(row, one):
+    """Write a vector to an array (3,)."""
+    row[0], row[1], row[2] = one[0], one[1], one[2]
+
+
+@njit_no_refcount
 def place_of(pose):
     """Return the translation of a pose (4, 4)."""
     return pose[0, 3], pose[1, 3], pose[2, 3]
@@ -96,6 +102,17 @@ def copy_pose(source, target):
     for r in range(4):
         for c in range(4):
             target[r, c] = source[r, c]
+
+
+@nb.njit(nogil=True, cache=True)
+def same_pose(one, other):
+    """Return whether two poses (4, 4) have the same bits."""
+    for r in range(4):
+        for c in range(4):
+            a, b = one[r, c], other[r, c]
+            if a != b or np.signbit(a) != np.signbit(b):
+                return False
+    return True
 
 
 @nb.njit(nogil=True, cache=True)

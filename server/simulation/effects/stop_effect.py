@@ -67,7 +67,7 @@ class StopRunner:
         self._level: Callable[[Frame], None] | None = None
         self._follow: Callable[[Frame], None] | None = self._follow_alone
         if walks:
-            from ..world.frame_walk import FOLLOW, walker_of
+            from ..world.walker import FOLLOW, walker_of
 
             walker = walker_of(world)
             walker.warm()

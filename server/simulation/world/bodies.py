@@ -7,7 +7,7 @@ query the bodies through `BodyObstacle` (body_obstacles.py).
 
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...kernels.walk.walk_bodies import refer_to_bodies
 from ...queries.scene_data import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Pose, Vec
@@ -103,8 +102,6 @@ class Bodies:
         self._users: dict[Hashable, Body] = {}
         self._known: dict[int, Shape] = {}
         self._numbered = 0
-        self._referred: tuple[Any, Any] = (None, None)
-        self._changes = 0  # of users' avatars, and of scratch
         # By user and object, see `_remember_origin`.
         self._came_from: dict[tuple[str, str], Vec] = {}
 
@@ -128,7 +125,6 @@ class Bodies:
             counters = self.scratch.counters
             self.scratch = make_body_scratch(nodes, blocks)
             self.scratch.counters[:] = counters
-            self._changes += 1
         shape = self._known[id(model.points)] = Shape(model, units, self._numbered, {})
         self._numbered += 1
         return shape
@@ -164,7 +160,6 @@ class Bodies:
             if self.shapes[row].model is not body.avatar:
                 self.shapes[row] = self.shape_of(body.avatar)
                 self.numbers[row] = self.shapes[row].number
-                self._changes += 1
             self._put(row, body.pose)
 
     def pop(self, user: Hashable, default: Body | None = None) -> Body | None:
@@ -186,23 +181,6 @@ class Bodies:
         """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
         with self.lock:
             self._add(name, PUSHED if pushed else KINEMATIC, model, rigid_pose(pose, f"object {name!r}"))
-
-    def reference(self, shape: Shape, wanted: int, margin_units: int) -> Any:
-        """Return a reference to the bodies of some kinds for the kernel `walk_frame`.
-
-        Return None unless all of them have the shape of the mover. wanted: kinds, bits.  margin_units:
-        distance to keep, exact units.
-        """
-        key = self.layout, self._changes, shape.number, wanted, margin_units
-        if self._referred[0] != key:
-            made, radius = None, float(shape.model.radius)
-            if (self.numbers[(self.kinds & wanted) != 0] == shape.number).all():
-                made = refer_to_bodies(
-                    shape.model.box, shape.units, margin_units, radius, radius + margin_units / UNITS_PER_METRE, wanted,
-                    self.poses, self.bounds, self.kinds, self.origin, self.up, self.scratch,
-                )  # fmt: skip
-            self._referred = key, made
-        return self._referred[1]
 
     def row_of(self, name: str, *, user: bool) -> int:
         """Return the row of a user or an object, or -1."""

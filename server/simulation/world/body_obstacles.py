@@ -1,7 +1,8 @@
 """BodyObstacle: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
 
 First, one kernel call of some microseconds tests the bounds of all bodies against those of the
-motion; usually no body is near. Near bodies are then tested exactly (kernels/bodies/body_sweep.py,
+motion; usually no body is near. The kernel `walk_frame` makes this test itself, and asks an obstacle
+only where a body is near. Near bodies are then tested exactly (kernels/bodies/body_sweep.py,
 kernels/bodies/body_pairs.py).
 
 A body that the mover overlaps when the frame begins blocks only a translation against
@@ -10,8 +11,8 @@ turn. Bodies that overlap, by their initial poses or because a motion command pl
 there, can therefore always separate.
 """
 
-import threading
-from typing import Any, NamedTuple
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,6 @@ from .vectors import dot, horizontal, norm, rotate
 
 # Tolerance for a translation across an overlapped body, so that rounding does not count as deeper.
 _ACROSS = 1e-9
-_NO_ORIGIN = np.zeros(3)
 
 
 class _FirstHit(NamedTuple):
@@ -55,7 +55,7 @@ class BodyObstacle:
         self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
         *, user: bool = True, margin_units: int = 0, skip: str = "", stop: StopFlag = NO_STOP,
     ) -> None:  # fmt: skip
-        """Prepare the obstacle.
+        """Prepare the obstacle. Its attributes `bodies`, `wanted` and `margin_units` are those given.
 
         name: of the effect.  wanted: kinds of bodies, bits.  mover: name of the mover.
         model, start: of the mover: its avatar, and its pose (4, 4) when the frame begins.
@@ -64,13 +64,12 @@ class BodyObstacle:
         stop: stop flag of the frame; once it is set, results are meaningless.
         """
         self.name = name
-        self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
+        self.bodies, self.wanted, self.margin_units = bodies, wanted, margin_units
         self._mover, self._user, self._skip, self._stop = mover, user, skip, stop
         self._model, self._start = model, start.copy()
         self._layout = bodies.layout
         self._overlapped: dict[int, bool] = {}
         self._hits: list[Hit] = []
-        self._shown = -1
 
     def sweep(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
@@ -96,38 +95,13 @@ class BodyObstacle:
         return hit
 
     @property
-    def lock(self) -> threading.RLock:
-        """Return the lock to hold while the kernel uses `reference`."""
-        return self._bodies.lock
+    def margin(self) -> float:
+        """Return the distance within which the kernel `walk_frame` has to ask about a body [m].
 
-    def reference(self, avatar: AvatarModel) -> tuple[Any, int] | None:
-        """Return a reference to the bodies for the kernel `walk_frame`, and the mover's row or -1.
-
-        Return None if only Python can answer: the bodies are not users with the mover's avatar, or one
-        was touched when the frame began.
+        It is infinite once a body is known to have been overlapped when the frame began: whether a
+        motion leads deeper does not depend on its bounds.
         """
-        bodies = self._bodies
-        if self._wanted != USER or self._skip or not len(avatar.points) or any(self._overlapped.values()):
-            return None
-        found = bodies.reference(bodies.shape_of(avatar), self._wanted, self._margin_units)
-        self._shown = bodies.layout
-        return None if found is None else (found, bodies.row_of(self._mover, user=self._user))
-
-    def name_hit(
-        self, row: int, fraction: float, witness: NDArray[np.float64], point: tuple[int, int]
-    ) -> Hit | None:
-        """Return the hit that the kernel found; None if the bodies' rows have changed since `reference`.
-
-        row, fraction, witness: as `_FirstHit`.  point: block and lane of the body's point.
-        """
-        bodies = self._bodies
-        with bodies.lock:
-            if bodies.layout != self._shown:
-                return None
-            number = int(bodies.shapes[row].model.rows[point[0], point[1]])
-            hit = self._hit_of(_FirstHit(row, fraction, witness, number))
-            self._hits.append(hit)
-            return hit
+        return math.inf if any(self._overlapped.values()) else self.margin_units / UNITS_PER_METRE
 
     def is_own(self, hit: Hit) -> bool:
         """Return whether this obstacle reported the hit."""
@@ -137,13 +111,13 @@ class BodyObstacle:
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool
     ) -> Hit | None:
         """Implement `sweep`."""
-        bodies = self._bodies
+        bodies = self.bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
             ends = self._from_origin(pose_from), self._from_origin(pose_to)
-            rows = self._near(shape, *ends)
+            rows = self._near(shape, pose_from, pose_to)
             if below and len(rows):
-                rows = rows[~self._beside(shape, ends[0], rows)]
+                rows = rows[~self._beside(shape, pose_from, rows)]
             while len(rows):
                 first = self._first(shape, ends, rows, tolerance)
                 if first is None:
@@ -155,13 +129,12 @@ class BodyObstacle:
 
     def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
         """Implement `touches`."""
-        bodies = self._bodies
+        bodies = self.bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
-            there = self._from_origin(pose)
-            rows = self._near(shape, there, there)
+            rows = self._near(shape, pose, pose)
             if len(rows):
-                rows = rows[bodies.touching(shape, pose, rows, self._margin_units, self._stop)]
+                rows = rows[bodies.touching(shape, pose, rows, self.margin_units, self._stop)]
             for row in rows.tolist():
                 if not self._is_overlapped(row):
                     return self._hit_at(shape, pose, row)
@@ -172,11 +145,10 @@ class BodyObstacle:
 
         Bodies that were touched when the frame began count too.
         """
-        bodies = self._bodies
+        bodies = self.bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
-            there = self._from_origin(pose)
-            rows = self._in_reach(shape, there, there)
+            rows = self._in_reach(shape, pose, pose)
             return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
@@ -188,21 +160,30 @@ class BodyObstacle:
         return False
 
     def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
-        """Return the rows (m,) whose bounds a motion, relative to the origin, may touch."""
-        bodies = self._bodies
+        """Return the rows (m,) whose bounds a motion may touch."""
+        bodies = self.bodies
         rows = np.empty(len(bodies.names), np.int64)
         if not len(rows) or not len(shape.model.points):
             return rows[:0]
         own = bodies.row_of(self._mover, user=self._user)
-        more = shape.model.radius + self._margin_units / UNITS_PER_METRE
+        more = shape.model.radius + self.margin_units / UNITS_PER_METRE
         count = find_near_bodies(
-            shape.model.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows
+            shape.model.box,
+            np.ascontiguousarray(first),
+            np.ascontiguousarray(last),
+            bodies.origin,
+            more,
+            bodies.bounds,
+            bodies.kinds,
+            self.wanted,
+            own,
+            rows,
         )
         return rows[:count]
 
     def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
         """Return the rows of `_in_reach`, except those overlapped when the frame began."""
-        bodies = self._bodies
+        bodies = self.bodies
         if self._layout != bodies.layout:
             self._layout, self._overlapped = bodies.layout, {}
         found = self._in_reach(shape, first, last)
@@ -212,12 +193,9 @@ class BodyObstacle:
         return found[~np.isin(found, left_out)] if len(found) and left_out else found
 
     def _beside(self, shape: Shape, pose: Pose, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which bodies (m,) stand beside the avatar: their tops are above the middle of its height.
-
-        pose: of the avatar, relative to the origin.
-        """
-        bodies, own = self._bodies, np.empty((2, 3))
-        bound_body(shape.model.box, pose, _NO_ORIGIN, shape.model.radius, own)
+        """Return which bodies (m,) stand beside the avatar: their tops are above the middle of its height."""
+        bodies, own = self.bodies, np.empty((2, 3))
+        bound_body(shape.model.box, np.ascontiguousarray(pose), bodies.origin, shape.model.radius, own)
         tops = np.maximum(bodies.bounds[rows, 0] * bodies.up, bodies.bounds[rows, 1] * bodies.up).sum(axis=1)
         heights = np.sort(own * bodies.up, axis=0).sum(axis=1)
         beside: NDArray[np.bool_] = tops > heights.mean()
@@ -226,14 +204,14 @@ class BodyObstacle:
     def _from_origin(self, pose: Pose) -> Pose:
         """Return a pose with its translation relative to the bodies' origin."""
         there = np.array(pose, np.float64, order="C")
-        there[:3, 3] -= self._bodies.origin
+        there[:3, 3] -= self.bodies.origin
         return there
 
     def _first(
         self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
     ) -> "_FirstHit | None":
         """Return the first hit of a motion with the bodies of these rows; None if there is none."""
-        bodies, numbers = self._bodies, self._bodies.numbers[rows]
+        bodies, numbers = self.bodies, self.bodies.numbers[rows]
         best: _FirstHit | None = None
         until = np.inf
         while len(rows):
@@ -243,7 +221,7 @@ class BodyObstacle:
                 witness, named = np.empty((2, 3)), np.empty(2, np.int64)
                 row, fraction = sweep_bodies(
                     shape.model.arrays, shape.model.box, shape.units, *ends, other.model.arrays, bodies.poses,
-                    other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, witness, named,
+                    other.units, rows[same], bodies.origin, self.margin_units, tolerance, until, witness, named,
                     bodies.scratch, self._stop.flag,
                 )  # fmt: skip
                 if row >= 0:
@@ -256,7 +234,7 @@ class BodyObstacle:
 
     def _hit_of(self, first: "_FirstHit") -> Hit:
         """Return the hit of the body that ended a motion, with its normal for an object."""
-        bodies, row, (own, other) = self._bodies, first.row, first.witness
+        bodies, row, (own, other) = self.bodies, first.row, first.witness
         normal = bodies.shapes[row].normal_at(first.point)
         if normal is not None:
             normal = rotate(bodies.poses[row], normal)
@@ -267,9 +245,9 @@ class BodyObstacle:
         """Return whether the mover touched a body when the frame began."""
         found = self._overlapped.get(row)
         if found is None:
-            bodies = self._bodies
+            bodies = self.bodies
             shape = bodies.shape_of(self._model)
-            touching = bodies.touching(shape, self._start, np.array([row]), self._margin_units, self._stop)
+            touching = bodies.touching(shape, self._start, np.array([row]), self.margin_units, self._stop)
             found = self._overlapped[row] = bool(touching[0])
         return found
 
@@ -283,12 +261,12 @@ class BodyObstacle:
             out = self._out(row)
             if dot(way, out) < -_ACROSS * norm(out) * norm(way):
                 center = shape.center(pose_from)
-                return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
+                return Hit(0.0, Verdict.CONTACT, center, center - out, self.bodies.names[row])
         return None
 
     def _out(self, row: int) -> Vec:
         """Return the direction out of a body that the mover overlapped when the frame began."""
-        bodies = self._bodies
+        bodies = self.bodies
         center = bodies.shape_of(self._model).center(self._start)
         return bodies.escape_direction(row, self._mover if self._user else "", center)
 
@@ -298,7 +276,7 @@ class BodyObstacle:
         The contact point is unknown, so the position is derived from the body's centre and the
         frame's start.
         """
-        bodies, center = self._bodies, shape.center(pose)
+        bodies, center = self.bodies, shape.center(pose)
         out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
         return Hit(0.0, Verdict.CONTACT, center, center - horizontal(out, bodies.up), bodies.names[row])
 

@@ -32,8 +32,7 @@ from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import pose_between
 from ...queries.contacts import contacts
 from ...queries.request import EXACT, QueryBudget
-from ...queries.resident_fast_path import collide_fast, distance_fast, has_unknown
-from ...queries.sweep import sweep
+from ...queries.resident_fast_path import collide_fast, distance_fast, has_unknown, sweep_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
@@ -48,6 +47,7 @@ _NO_ORIGIN = np.zeros(3)
 SPARSE_FACTOR = 3.0
 # `Verdict` of its number: making one takes as long as a fifth of a query.
 _VERDICTS = {int(verdict): verdict for verdict in Verdict}
+_CLEAR, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.UNKNOWN)
 
 
 class _Held(threading.local):
@@ -67,7 +67,7 @@ class World:
 
     file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
     is_alone: whether it is a single archive at the identity.
-    walker: see `walker_of` in frame_walk.py.  bodies: see `bodies_of` in body_effects.py.
+    walker: see `walker_of` in walker.py.  bodies: see `bodies_of` in body_effects.py.
     """
 
     walker: Any = None
@@ -159,19 +159,26 @@ class World:
 
         ask: queries an archive, in its frame.  same: columns whose first value tells that archive.
         """
-        with self as held:
-            found: list[_Answers] = ask_held(held, ask)
-        answers, number = merge_answers(found), 0
-        if len(found) > 1 and same:
-            named = [
-                b"".join(getattr(each, name)[:1].tobytes() for name in same) for each in (answers, *found)
-            ]
-            number = named.index(named[0], 1) - 1
-        verdict = answers.verdict[0]
-        if not (isinstance(answers, SweepAnswers) and verdict == Verdict.CLEAR):  # proved without them
+        held, number = self._held, 0
+        if self.is_alone and held.depth:  # nothing to transform or to merge
+            answers: Any = ask(held.archives[0])
+        else:
+            with self as archives:
+                found: list[Any] = ask_held(archives, ask)
+            answers = merge_answers(found)
+            if len(found) > 1 and same:
+                named = [
+                    b"".join([getattr(each, name)[:1].tobytes() for name in same])
+                    for each in (answers, *found)
+                ]
+                number = named.index(named[0], 1) - 1
+        verdict, missing = answers.verdict.item(0), answers.voxels_missing.item(0)
+        # A motion that the level of detail proves clear lacks nothing.
+        if answers.late and not (isinstance(answers, SweepAnswers) and verdict == _CLEAR):
             budget.lacked(len(answers.late))
-        missing = 0 if isinstance(answers, CollideAnswers) else int(answers.voxels_missing[0])
-        self.count(int(answers.node_visits[0]), missing or verdict == Verdict.UNKNOWN)
+        held.visits += answers.node_visits.item(0)
+        if verdict == _UNKNOWN or (missing and not isinstance(answers, CollideAnswers)):
+            held.unknown = True
         return answers, number
 
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
@@ -180,7 +187,7 @@ class World:
         answers, _ = self._ask(
             budget, lambda each: collide_fast(each.data, avatar, each.placed.poses_in(poses), 0.0, budget)
         )
-        return _VERDICTS[int(answers.verdict[0])]
+        return _VERDICTS[answers.verdict.item(0)]
 
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
@@ -204,22 +211,12 @@ class World:
         """Return the contacts at a pose; see server/queries/contacts.py. limit: of each archive."""
         return self._contacts(avatar, pose, limit, margin, cluster_distance, budget)[0]
 
-    def _contacts(
-        self,
-        avatar: AvatarModel,
-        pose: Pose,
-        limit: int,
-        margin: float,
-        cluster_distance: float | None,
-        budget: QueryBudget,
-    ) -> tuple[ContactsAnswers, int]:
-        """Return the contacts at a pose, and the archive of the deepest one. Arguments as for `contacts`."""
+    def _contacts(self, avatar: AvatarModel, pose: Pose, *how: Any) -> tuple[ContactsAnswers, int]:
+        """Return the contacts at a pose, and the archive of the deepest one. how: as for `contacts`."""
         poses = pose[None]
         return self._ask(
-            budget,
-            lambda each: contacts(
-                each.data, avatar, each.placed.poses_in(poses), limit, margin, cluster_distance, budget
-            ),
+            how[-1],
+            lambda each: contacts(each.data, avatar, each.placed.poses_in(poses), *how),
             "signed_distance",
             "cloud_point",
             "avatar_point",
@@ -243,7 +240,7 @@ class World:
         )
         if found.distance[0] == np.inf:
             return None
-        return Hit(0.0, _VERDICTS[int(found.verdict[0])], None, found.cloud_point[0], "", number)
+        return Hit(0.0, _VERDICTS[found.verdict.item(0)], None, found.cloud_point[0], "", number)
 
     def sweep(
         self,
@@ -260,7 +257,7 @@ class World:
         first, last = pose_from[None], pose_to[None]
         found, number = self._ask(
             budget,
-            lambda each: sweep(
+            lambda each: sweep_fast(
                 each.data,
                 avatar,
                 each.placed.poses_in(first),
@@ -273,13 +270,13 @@ class World:
             "witness_cloud",
             "witness_avatar",
         )
-        verdict, exact = _VERDICTS[int(found.verdict[0])], bool(found.exact[0])
+        verdict, exact = _VERDICTS[found.verdict.item(0)], found.exact.item(0)
         if not exact:
             with self as held:  # a stop may leave places unexamined too
                 self.count(0, bool(budget.stop) or any(has_unknown(each.data) for each in held))
         if verdict == Verdict.CLEAR:
             return None
-        lower, upper = float(found.lower[0]), float(found.upper[0])
+        lower, upper = found.lower.item(0), found.upper.item(0)
         if verdict == Verdict.UNKNOWN:
             return Hit(lower, verdict, None, None, exact=exact)
         return Hit(
@@ -322,27 +319,18 @@ class World:
         Return None too if a voxel within reach cannot be read, or is not in memory and the budget
         does not wait: the frame is then `unknown`.
         """
-        held = self._held
-        with self as archives:
-            each = archives[archive]
-            normals, pose = normals_of(each), each.placed.pose
-            place, way = touched_in_archive(each, cloud, toward[None])
-            waits = budget.late is None
-            try:
-                found: Vec | None = normals.at(place, way[0], reach, held.stop, waits=waits)
-                if found is None:
-                    farther = min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH)
-                    found = normals.at(place, way[0], farther, held.stop, waits=waits)
-            except CorruptError:
-                held.unknown = True
-                return None
-            except StoppedError:
-                if waits or held.stop:
-                    raise
-                budget.lacked(1)
-                held.unknown = True
-                return None
-            return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
+
+        def ask(normals: Any, place: Vec, ways: NDArray[np.float64], **how: Any) -> Vec | None:
+            found: Vec | None = normals.at(place, ways[0], reach, **how)
+            if found is None:
+                found = normals.at(place, ways[0], min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH), **how)
+            return found
+
+        found, pose = (
+            self._ask_surface(archive, cloud, toward[None], budget, ask),
+            self.archives[archive].pose,
+        )
+        return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
     def highest(
         self, hit: Hit, directions: NDArray[np.float64], reach: float, budget: QueryBudget = EXACT
@@ -353,24 +341,40 @@ class World:
         a voxel within reach is not in memory, or cannot be read.
         """
         assert hit.cloud is not None
+        found = self._ask_surface(
+            hit.archive, hit.cloud, directions, budget,
+            lambda normals, place, ways, **how: normals.highest(place, ways, reach, **how),
+        )  # fmt: skip
+        return np.zeros(len(directions)) if found is None else found
+
+    def _ask_surface(
+        self,
+        archive: int,
+        cloud: Vec,
+        ways: NDArray[np.float64],
+        budget: QueryBudget,
+        ask: Callable[..., NDArray[np.float64] | None],
+    ) -> NDArray[np.float64] | None:
+        """Return what `ask` says of the surface at a scan point; None if a voxel within reach is lacking.
+
+        cloud: (3,), ways: directions (k, 3), world.  ask: takes `Normals` and these in the archive's
+        frame.
+        """
         held, waits = self._held, budget.late is None
         with self as archives:
-            each = archives[hit.archive]
-            place, ways = touched_in_archive(each, hit.cloud, directions)
+            each = archives[archive]
+            place, inverse = each.placed.points_in(cloud[None])[0], each.placed.inverse
+            ways = ways if inverse is None else rotate_vectors(inverse, ways)
             try:
-                found: NDArray[np.float64] = normals_of(each).highest(
-                    place, ways, reach, held.stop, waits=waits
-                )
+                return ask(normals_of(each), place, ways, stop=held.stop, waits=waits)
             except CorruptError:
-                held.unknown = True
-                return np.zeros(len(directions))
+                pass
             except StoppedError:
                 if waits or held.stop:
                     raise
                 budget.lacked(1)
-                held.unknown = True
-                return np.zeros(len(directions))
-        return found
+            held.unknown = True
+            return None
 
 
 def normals_of(seen: HeldArchive) -> Any:
@@ -383,13 +387,3 @@ def normals_of(seen: HeldArchive) -> Any:
 
         normals = kept.setdefault("normals", Normals(seen.data, seen.opened.store.archive))
     return normals
-
-
-def touched_in_archive(
-    seen: HeldArchive, cloud: Vec, ways: NDArray[np.float64]
-) -> tuple[Vec, NDArray[np.float64]]:
-    """Return a scan point (3,) and directions (k, 3) of the world in an archive's frame."""
-    inverse = seen.placed.inverse
-    if inverse is None:
-        return cloud, ways
-    return transform_points(inverse, cloud[None])[0], rotate_vectors(inverse, ways)

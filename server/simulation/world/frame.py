@@ -93,7 +93,7 @@ class Frame:
     simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     apart: whether it is proved that no obstacle is touched at `pose`.
-    walks, walk_hits: for frame_walk.py: whether a part has run, and the hits that Python answered with, by
+    walks, walk_hits: for walker.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
     leaving: the last pose in contact from which a motion began (leaving.py), or None.
     """

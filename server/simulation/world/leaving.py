@@ -41,7 +41,7 @@ _LEAVES = 0.2
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 # First step back from a pose that turns out not to be clear [m], and its growth factor, as in
-# kernels/walk/walk_motions.py.
+# kernels/walk/motions.py.
 _FIRST_STEP_BACK, _STEP_GROWTH = 1e-7, 4.0
 
 

@@ -194,11 +194,11 @@ def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> Non
             edges = [low - 1e-3, low + 1e-3, high - 1e-3, high + 1e-3]
             bounds[:, 0, axis] = [-9.0, -9.0, edges[2], edges[3]]
             bounds[:, 1, axis] = [edges[0], edges[1], 9.0, 9.0]
-            rows = np.full(5, -7)
-            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
+            rows, motion = np.full(5, -7), (box, first, last, np.zeros(3))
+            assert body_pairs.find_near_bodies(*motion, 0.07, bounds, kinds, 6, -1, rows) == 2
             assert rows.tolist() == [1, 2, -7, -7, -7]
-            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
-            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
+            assert body_pairs.find_near_bodies(*motion, 0.07, bounds, kinds, 5, -1, rows) == 0
+            assert body_pairs.find_near_bodies(*motion, 0.07, bounds, kinds, 2, 1, rows) == 1
             assert rows[0] == 2
 
 

@@ -146,12 +146,12 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
 ) -> None:
     """A graze just before the contact: all was looked at."""
     case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    ask = collision_world.sweep
+    ask = collision_world.sweep_fast
 
     def graze(*what: Any) -> Any:
         return structs.replace(ask(*what), exact=np.zeros(1, bool), lower=np.full(1, 0.2))
 
-    monkeypatch.setattr(collision_world, "sweep", graze)
+    monkeypatch.setattr(collision_world, "sweep_fast", graze)
     monkeypatch.setattr(collision_world, "has_unknown", lambda data: unknown)
     with Scene.open(case.archive) as scene:
         for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):

@@ -9,7 +9,7 @@ import pytest
 from effect_rooms import Play, at, play
 from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.kernels.walk.walk_state import FOLLOW, SLIDE
+from solidcloud.server.kernels.walk.state import FOLLOW, SLIDE
 from solidcloud.server.simulation.world.frame import Frame, Hit, translated
 
 # Radius and spacing of the spheres of scan and body [m], interpreted too: an edge needs dense points.

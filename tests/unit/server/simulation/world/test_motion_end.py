@@ -8,11 +8,11 @@ from effect_rooms import INTERPRETED
 from solidcloud.schemas.scene.effect_table import AnyEffect, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.placed_archive import PlacedArchive
-from solidcloud.server.kernels.walk.walk_state import FOLLOW
+from solidcloud.server.kernels.walk.state import FOLLOW
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
-from solidcloud.server.simulation.world.frame_walk import walker_of
+from solidcloud.server.simulation.world.walker import walker_of
 
 MOTIONS = 6 if INTERPRETED else 80
 

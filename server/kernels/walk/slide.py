@@ -1,17 +1,32 @@
 """Slide along the touched surfaces, their creases and corners; see effects/motion_effects.py."""
 
+import math
+
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.normal_codes import MAX_NORMAL_REACH
-from .contact_normal import contact_normal
-from .slide_planes import ROUNDING, clip, limit_displacement
-from .walk_motions import advance, keep_rest, move_to
-from .walk_normals import hit_normal, scan_heights
-from .walk_queries import pair_of
-from .walk_state import ARCHIVE, BEGIN, BLOCKED, HAS_PAIR, HITS, TARGET, UNKNOWN, VERDICT, pose_now
-from .walk_vectors import copy_pose, divided, dot, minus, norm, place_of, times, translated, vector
+from .motions import advance, keep_rest, move_to
+from .normals import contact_normal, hit_normal, scan_heights
+from .queries import pair_of
+from .state import UNKNOWN, pose_now
+from .walk_vectors import (
+    copy_pose,
+    cross,
+    divided,
+    dot,
+    minus,
+    norm,
+    place_of,
+    put,
+    times,
+    translated,
+    vector,
+)
 
+# A displacement may lead into a surface by this share of its length, which is rounding.
+ROUNDING = 1e-9
 # Least share of the remainder that must lie along the surfaces to slide: 6 degrees off head on.
 # Smoothed normals are wrong by a few degrees: at 0.02, an avatar pushed straight at a flat wall
 # crept along it.
@@ -45,14 +60,65 @@ MOTIONS_PER_SURFACE = 2
 FLAT_REACH_FACTOR = 3.0
 
 
+@njit_no_refcount
+def limit_displacement(gone, way, most):
+    """Shorten a displacement so that its sum with `gone` is at most `most` long [m].
+
+    gone, way: vectors. The direction of `way` is kept.
+    """
+    a, b, c = dot(way, way), dot(gone, way), dot(gone, gone) - most * most * (1.0 - 1e-12)
+    if a + 2.0 * b + c <= 0.0:
+        return way
+    root = b * b - a * c
+    share = (math.sqrt(root) - b) / a if root > 0.0 and c < 0.0 else 0.0
+    return times(max(0.0, share), way)
+
+
+@njit_no_refcount
+def _is_free(way, planes, count, least):
+    free = True
+    for n in range(count):
+        free &= dot(way, vector(planes[n])) >= least
+    return free
+
+
+@nb.njit(nogil=True, cache=True)
+def clip(rest, planes, count):
+    """Return whether a displacement can be clipped, and its longest projection that leads into no plane.
+
+    planes: (p, 3) unit normals that point to the free side; the first `count` count. The candidates are
+    the displacement itself, then its projections onto one plane, then those onto the crease of two.
+    """
+    least = -ROUNDING * norm(rest)
+    if _is_free(rest, planes, count, least):
+        return True, rest
+    best, longest = rest, -1.0
+    for n in range(count):
+        plane = vector(planes[n])
+        way = minus(rest, times(dot(rest, plane), plane))
+        if norm(way) > longest and _is_free(way, planes, count, least):
+            best, longest = way, norm(way)
+    if longest >= 0.0:
+        return True, best
+    for n in range(count):
+        for m in range(n + 1, count):
+            crease = cross(vector(planes[n]), vector(planes[m]))
+            square = dot(crease, crease)
+            if square > 1e-6:
+                way = times(dot(rest, crease) / square, crease)
+                if norm(way) > longest and _is_free(way, planes, count, least):
+                    best, longest = way, norm(way)
+    return longest >= 0.0, best
+
+
 @nb.njit(nogil=True, cache=True)
 def slide_command(walk):
     """Slide along what obstructed the motion command, then turn in place."""
     memory = walk.memory
-    hit = memory.numbers[BLOCKED]
+    hit = memory.state[0].blocked
     if hit < 0:
         return
-    target, begin = memory.poses[TARGET], place_of(memory.poses[BEGIN])
+    target, begin = memory.target, place_of(memory.begin)
     command, rest = minus(place_of(target), begin), minus(place_of(target), place_of(pose_now(walk)))
     far = norm(rest)
     if far > 0.0:
@@ -80,7 +146,7 @@ def slide_along(walk, hit, rest, command, upright):
     upright: treat a surface that is too steep to walk on as vertical, with `ground`.
     Return the hit that ended the motion, or -1.
     """
-    surfaces = walk.settings.surfaces
+    surfaces = walk.settings[0].surfaces
     start, most = minus(place_of(pose_now(walk)), minus(command, rest)), norm(command)
     # Distinct planes touched so far. A plane that is touched again, or that the motion did not lead
     # into, is taken for a bump.
@@ -157,11 +223,11 @@ def _over_bump(walk, out, way, command, start):
     Return whether that led farther along the motion command, and the hit that ended it. If not,
     the frame is restored.
     """
-    numbers, before = walk.memory.numbers, np.empty((4, 4))
+    state, before = walk.memory.state[0], np.empty((4, 4))
     copy_pose(pose_now(walk), before)
-    origin, hits, ended = place_of(before), numbers[HITS], -1
+    origin, hits, ended = place_of(before), state.hits, -1
     most, least = norm(command), MIN_GAIN * norm(way) * norm(command)
-    lift, last = FIRST_LIFT * walk.settings.lift, LAST_LIFT * walk.settings.lift
+    lift, last = FIRST_LIFT * walk.settings[0].lift, LAST_LIFT * walk.settings[0].lift
     back = -dot(out, command)
     if back > 0.0:
         less = MAX_LIFT_LOSS * dot(way, command) / back
@@ -171,13 +237,13 @@ def _over_bump(walk, out, way, command, start):
     while True:
         off = limit_displacement(minus(origin, start), times(lift, out), most)
         advance(walk, translated(before, off))
-        numbers[HITS] = hits
+        state.hits = hits
         on = limit_displacement(minus(place_of(pose_now(walk)), start), way, most)
         ended = advance(walk, translated(pose_now(walk), on))
         if dot(minus(place_of(pose_now(walk)), origin), command) >= least:
             return True, ended
         move_to(walk, before)
-        numbers[HITS] = hits
+        state.hits = hits
         if lift == last:
             return False, ended
         lift = last
@@ -191,7 +257,7 @@ def _flat_plane(walk, hit, plane):
     scan is flat there, and the normal agrees with that of the plane.
     hit: on the plane.  plane: its normal.
     """
-    if walk.memory.tape[hit, ARCHIVE] < 0.0:
+    if walk.memory.tape[hit].archive < 0:
         return False, plane, 0.0
     known, normal = hit_normal(walk, hit, FLAT)
     if not known:
@@ -201,7 +267,7 @@ def _flat_plane(walk, hit, plane):
         both[0, r], both[1, r] = normal[r], -normal[r]
     high, low, _ = scan_heights(walk, hit, both, FLAT)
     wall = _wall(walk, normal)
-    reach = min(FLAT_REACH_FACTOR * walk.settings.normal_reach, MAX_NORMAL_REACH)
+    reach = min(FLAT_REACH_FACTOR * walk.settings[0].normal_reach, MAX_NORMAL_REACH)
     if max(high, low) > MAX_FLAT_HEIGHT_SHARE * reach or dot(wall, plane) < SAME_PLANE_COSINE:
         return False, plane, 0.0
     return True, wall, high + MORE_BUMP_SHARE * (high + low)
@@ -214,11 +280,11 @@ def _back_off(walk, out, way):
     A nearly head-on push cannot pass a bump that is steeper than the push is oblique. The avatar
     therefore does not enter the hollows between bumps.
     """
-    numbers = walk.memory.numbers
-    way, hits = min(way, LAST_LIFT * walk.settings.lift), numbers[HITS]
+    state = walk.memory.state[0]
+    way, hits = min(way, LAST_LIFT * walk.settings[0].lift), state.hits
     if way >= MIN_SLIDE:
         advance(walk, translated(pose_now(walk), times(way, out)))
-        numbers[HITS] = hits
+        state.hits = hits
 
 
 @nb.njit(nogil=True, cache=True)
@@ -226,10 +292,10 @@ def _surface(walk, hit, upright):
     """Return whether the normal of a touched plane is known, and it; store it if the hit is the last."""
     memory = walk.memory
     result = memory.tape[hit]
-    if result[VERDICT] == UNKNOWN or result[HAS_PAIR] == 0.0:
+    if result.verdict == UNKNOWN or not result.has_pair:
         return False, (0.0, 0.0, 0.0)
     known, normal = contact_normal(walk, hit)
-    last = memory.numbers[HITS] - 1
+    last = memory.state[0].hits - 1
     if not known:
         own, cloud = pair_of(walk, hit)
         out = minus(own, cloud)
@@ -237,19 +303,18 @@ def _surface(walk, hit, upright):
         if across == 0.0:
             return False, normal
         normal = divided(out, across)
-    elif last >= 0 and memory.hits[last] == hit:
-        memory.normals[last, 0] = 1.0
-        for r in range(3):
-            memory.normals[last, 1 + r] = normal[r]
+    elif last >= 0 and memory.hits[last].row == hit:
+        memory.hits[last].has_normal = True
+        put(memory.hits[last].normal, normal)
     return True, _wall(walk, normal) if upright else normal
 
 
 @nb.njit(nogil=True, cache=True)
 def _wall(walk, normal):
     """Return the normal of a plane for a walking avatar: horizontal if it is too steep."""
-    up = vector(walk.settings.up)
+    up = vector(walk.settings[0].up)
     rises = dot(normal, up)
-    if rises >= walk.settings.walkable_slide:
+    if rises >= walk.settings[0].walkable_slide:
         return normal
     level = minus(normal, times(rises, up))
     length = norm(level)

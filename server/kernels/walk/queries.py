@@ -1,4 +1,4 @@
-"""Queries of a walking avatar, answered from what is in memory or by Python; see walk_state.py.
+"""Queries of a walking avatar, answered from what is in memory or by Python; see state.py.
 
 A hit is the number of its row of the tape; -1 stands for none.
 """
@@ -6,66 +6,37 @@ A hit is the number of its row of the tape; -1 stands for none.
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
+from ..bodies.body_pairs import find_near_bodies
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID
-from ..motion.sweep_resident import (
-    AVATAR,
-    CLOUD,
-    END,
-    ENDED,
-    LOWER,
-    MAX_UNDECIDED,
-    OPEN,
-    POINT,
-    PROVED,
-    SPEED,
-    UPPER,
-    longest_way,
-    pose_between,
-    sweep_resident,
-)
+from ..motion.sweep_resident import MAX_UNDECIDED, OPEN, PROVED, longest_way, pose_between, sweep_resident
 from ..rays.hits import nearest_in_memory
-from .walk_obstacles import first_body, touches_no_body
-from .walk_state import (
-    ANSWER,
-    ARCHIVE,
+from .state import (
     BODIES_AT,
+    BODIES_SWEPT,
     CLEAR,
     CLEAR_AT,
     CONTACT,
-    FRAME_VERDICT,
     GIVES_WAY,
-    HAS_END,
-    HAS_NORMAL,
-    HAS_PAIR,
-    HAS_POINT,
-    KNOWN,
     LANDS,
-    MISSED,
-    NAMED,
+    NEAR,
     NEAREST,
-    PART,
-    REST,
-    STAYS,
-    SWEPT,
+    SWEPT_TO,
     TOUCHED,
     UNKNOWN,
-    UNLOADED,
-    VERDICT,
-    VISITS,
     ask,
     next_row,
     pose_now,
     use_voxels,
 )
-from .walk_vectors import copy_pose, norm, vector
+from .walk_vectors import copy_pose, minus, norm, place_of, put, rotate_back, same_pose, vector
 
 
 @nb.njit(nogil=True, cache=True)
 def pair_of(walk, hit):
     """Return the centres of the two touching spheres of a hit: the avatar's and the other, world [m]."""
     row = walk.memory.tape[hit]
-    return vector(row[AVATAR:CLOUD]), vector(row[CLOUD:ENDED])
+    return vector(row.avatar), vector(row.cloud)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -86,28 +57,44 @@ def pose_on_way(walk, pose_from, pose_to, fraction, pose):
 @nb.njit(nogil=True, cache=True)
 def count_visits(walk, visits, missed):
     """Add the cost of a query. missed: whether something in reach was not examined."""
-    log = walk.memory.log
-    log[VISITS + walk.memory.numbers[PART]] += visits
+    log = walk.memory.log[0]
+    log.visits[walk.memory.state[0].part] += visits
     if missed:
-        log[MISSED] = 1
+        log.missed = True
 
 
 @nb.njit(nogil=True, cache=True)
 def ask_at(walk, query, place):
-    """Ask about a place; see `WalkCall._answer` in frame_walk.py for the numbers that each query gives."""
-    for r in range(3):
-        walk.memory.asked[r] = place[r]
+    """Ask about a place."""
+    put(walk.memory.question[0].place, place)
     ask(walk.memory, query)
 
 
 @nb.njit(nogil=True, cache=True)
 def _ask_motion(walk, query, to, tolerance, skin, below):
     """Ask about the motion to a pose (4, 4)."""
-    memory = walk.memory
+    memory, question = walk.memory, walk.memory.question[0]
     copy_pose(pose_now(walk), memory.asked_poses[0])
     copy_pose(to, memory.asked_poses[1])
-    memory.asked[0], memory.asked[1], memory.asked[2] = tolerance, skin, 1.0 if below else 0.0
+    question.tolerance, question.skin, question.below = tolerance, skin, below
     ask(memory, query)
+
+
+@nb.njit(nogil=True, cache=True)
+def _is_far_from_bodies(walk, pose_from, pose_to):
+    """Return whether the bounds of no body meet those of a motion; False where only Python answers."""
+    log, count = walk.memory.log[0], 1
+    if walk.native:
+        rows = np.empty(walk.bounds.shape[0], np.int64)
+        count = find_near_bodies(
+            walk.avatar.box, pose_from, pose_to, walk.bounds_origin, walk.avatar.radius + walk.margin, walk.bounds,
+            walk.kinds, walk.wanted, walk.own, rows,
+        )  # fmt: skip
+    if count > 0:
+        log.apart = NEAR
+    elif log.apart != NEAR and same_pose(pose_from, walk.memory.begin):
+        log.apart = 1
+    return count == 0
 
 
 @nb.njit(nogil=True, cache=True)
@@ -119,18 +106,13 @@ def first_hit(walk, to, tolerance, skin, below):
     """
     memory = walk.memory
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
+    if row >= memory.log[0].known:
         if not (walk.native and _sweep(walk, to, tolerance, skin, row)):
-            _ask_motion(walk, SWEPT, to, tolerance, skin, below)
-        if walk.bodies:
-            clear = memory.tape[row, VERDICT] == CLEAR
-            query = first_body(
-                walk, walk.standing, to, tolerance, below, np.inf if clear else memory.tape[row, LOWER]
-            )
-            if query >= 0:
-                _ask_motion(walk, query, to, tolerance, skin, below)
-        memory.log[KNOWN] = row + 1
-    return -1 if memory.tape[row, VERDICT] == CLEAR else row
+            _ask_motion(walk, SWEPT_TO, to, tolerance, skin, below)
+        if walk.bodies and not _is_far_from_bodies(walk, pose_now(walk), to):
+            _ask_motion(walk, BODIES_SWEPT, to, tolerance, skin, below)
+        memory.log[0].known = row + 1
+    return -1 if memory.tape[row].verdict == CLEAR else row
 
 
 @nb.njit(nogil=True, cache=True)
@@ -141,28 +123,28 @@ def _sweep(walk, to, tolerance, skin, row):
     within = max(tolerance, walk.least_tolerance)
     needed, verdict, visits, _, _ = sweep_resident(
         pose, to, walk.avatar, walk.scratch, walk.other_units, walk.held, walk.stop, walk.unknown_everywhere, within,
-        skin, result[:VERDICT],
+        skin, result,
     )  # fmt: skip
     if needed < 0:
         return False
-    if verdict == CONTACT and result[UPPER] == 0.0 and memory.numbers[FRAME_VERDICT] == CONTACT:
+    if verdict == CONTACT and result.upper == 0.0 and memory.state[0].verdict == CONTACT:
         return False  # the frame began in contact: Python answers such motions
     use_voxels(walk, needed)
     exact = True
     if verdict == CONTACT:
-        apart = result[UPPER] - result[LOWER]
-        exact = apart == 0.0 or result[SPEED] * apart <= within
+        apart = result.upper - result.lower
+        exact = apart == 0.0 or result.speed * apart <= within
         if not exact and not farthest_motion(walk, pose, to) * apart <= MAX_UNDECIDED:
             verdict = UNKNOWN
     part_unknown = walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0
     count_visits(walk, visits, (verdict == UNKNOWN and exact) or (not exact and part_unknown))
     pair, ends = verdict == CONTACT, verdict == CONTACT and skin >= 0.0
-    result[VERDICT], result[ARCHIVE] = verdict, 0.0 if pair else -1.0
-    result[HAS_PAIR], result[HAS_POINT] = 1.0 if pair else 0.0, 1.0 if ends else 0.0
-    result[HAS_END] = 1.0 if ends and result[ENDED] != OPEN else 0.0
-    if ends and result[ENDED] != OPEN and result[ENDED] != PROVED:
-        copy_pose(pose, result[END:VERDICT].reshape(4, 4))
-    result[HAS_NORMAL], result[NAMED], result[UNLOADED], result[REST] = 0.0, 0.0, 0.0, 0.0
+    result.verdict, result.archive = verdict, 0 if pair else -1
+    result.has_pair, result.has_point = pair, ends
+    result.has_end = ends and result.ended != OPEN
+    if result.has_end and result.ended != PROVED:
+        copy_pose(pose, result.end)
+    result.has_normal, result.named, result.unloaded, result.rest = False, False, False, 0.0
     return True
 
 
@@ -196,17 +178,17 @@ def is_clear(walk, pose, proved):
         return True
     memory = walk.memory
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
+    if row >= memory.log[0].known:
         copy_pose(pose, memory.asked_poses[0])
-        memory.asked[0] = 1.0 if proved else 0.0
+        memory.question[0].proved = proved
         verdict = CLEAR if proved else _collide(walk, pose) if walk.native else -1
         if verdict < 0:
             ask(memory, CLEAR_AT)
-        if verdict == CLEAR and walk.bodies and not touches_no_body(walk, walk.standing, pose):
+        if verdict == CLEAR and walk.bodies and not _is_far_from_bodies(walk, pose, pose):
             ask(memory, BODIES_AT)
-        memory.tape[row, ANSWER] = 1.0 if verdict == CLEAR else 0.0
-        memory.log[KNOWN] = row + 1
-    return memory.tape[row, ANSWER] != 0.0
+        memory.tape[row].answer = verdict == CLEAR
+        memory.log[0].known = row + 1
+    return memory.tape[row].answer
 
 
 @nb.njit(nogil=True, cache=True)
@@ -214,25 +196,27 @@ def hit_at(walk, pose):
     """Return a hit with fraction 0 if a pose (4, 4) touches something or is unknown."""
     memory = walk.memory
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
-        if walk.bodies or not walk.native or _collide(walk, pose) != CLEAR:
+    if row >= memory.log[0].known:
+        far = not walk.bodies or _is_far_from_bodies(walk, pose, pose)
+        if not far or not walk.native or _collide(walk, pose) != CLEAR:
             copy_pose(pose, memory.asked_poses[0])
             ask(memory, TOUCHED)
-        memory.tape[row, VERDICT] = CLEAR
-        memory.log[KNOWN] = row + 1
-    return -1 if memory.tape[row, VERDICT] == CLEAR else row
+        memory.tape[row].verdict = CLEAR
+        memory.log[0].known = row + 1
+    return -1 if memory.tape[row].verdict == CLEAR else row
 
 
 @nb.njit(nogil=True, cache=True)
 def gives_way(walk, hit, to):
     """Let the touched body give way; return whether the motion to a pose (4, 4) should be tried again."""
     memory = walk.memory
-    if memory.tape[hit, NAMED] == 0.0 or memory.tape[hit, NAMED] == STAYS:
+    if not memory.tape[hit].named:
         return False
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
-        _ask_motion(walk, GIVES_WAY, to, np.float64(hit), 0.0, False)
-    return memory.tape[row, ANSWER] != 0.0
+    if row >= memory.log[0].known:
+        memory.question[0].hit = hit
+        _ask_motion(walk, GIVES_WAY, to, 0.0, 0.0, False)
+    return memory.tape[row].answer
 
 
 @nb.njit(nogil=True, cache=True)
@@ -240,32 +224,32 @@ def nearest_point(walk, place, reach):
     """Return the row with the scan point nearest to a place within `reach` [m]; -1 if there is none."""
     memory = walk.memory
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
+    if row >= memory.log[0].known:
         needed, known, visits = -1, False, 0
         if walk.native and not (walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0):
-            cloud = memory.tape[row, CLOUD:ENDED]
+            cloud = memory.tape[row].cloud
             needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, cloud)
         if needed < 0:
-            memory.asked[3] = reach
+            memory.question[0].reach = reach
             ask_at(walk, NEAREST, place)
         use_voxels(walk, needed)
         count_visits(walk, visits, False)
-        memory.tape[row, HAS_PAIR], memory.tape[row, ARCHIVE] = 1.0 if known else 0.0, 0.0
-        memory.log[KNOWN] = row + 1
-    return row if memory.tape[row, HAS_PAIR] != 0.0 else -1
+        memory.tape[row].has_pair, memory.tape[row].archive = known, 0
+        memory.log[0].known = row + 1
+    return row if memory.tape[row].has_pair else -1
 
 
 @nb.njit(nogil=True, cache=True)
 def lands(walk, reach, stood):
-    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in frame_walk.py.
+    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in walker.py.
 
     reach: distance below that is free [m].  stood: whether it stood in the last frame.
     """
     memory = walk.memory
     row = next_row(memory)
-    if row >= memory.log[KNOWN]:
+    if row >= memory.log[0].known:
         copy_pose(pose_now(walk), memory.asked_poses[0])
-        memory.asked[0], memory.asked[1] = reach, 1.0 if stood else 0.0
+        memory.question[0].reach, memory.question[0].stood = reach, stood
         ask(memory, LANDS)
     return row
 
@@ -279,24 +263,19 @@ def motion_left(walk, to):
 
 @nb.njit(nogil=True, cache=True)
 def touching_point(walk, to, hit):
-    """Write the centre of the avatar's touching sphere at a hit (3,), avatar frame, to a new array.
+    """Return the centre of the avatar's touching sphere at a hit, avatar frame.
 
     The hit ended the motion from the frame's pose to a pose (4, 4).
     """
-    result, there, point = walk.memory.tape[hit], np.empty((4, 4)), np.empty(3)
-    pose_on_way(walk, pose_now(walk), to, min(result[LOWER], 1.0), there)
-    x, y, z = result[AVATAR] - there[0, 3], result[AVATAR + 1] - there[1, 3], result[AVATAR + 2] - there[2, 3]
-    for k in range(3):
-        point[k] = there[0, k] * x + there[1, k] * y + there[2, k] * z
-    return point
+    result, there = walk.memory.tape[hit], np.empty((4, 4))
+    pose_on_way(walk, pose_now(walk), to, min(result.lower, 1.0), there)
+    return rotate_back(there, minus(vector(result.avatar), place_of(there)))
 
 
 @nb.njit(nogil=True, cache=True)
 def keep_point(walk, to, hit):
     """Complete a hit of the scan that ended the motion to a pose (4, 4) with its touching point."""
     result = walk.memory.tape[hit]
-    if result[ARCHIVE] >= 0.0 and result[HAS_PAIR] != 0.0 and result[HAS_POINT] == 0.0:
-        point = touching_point(walk, to, hit)
-        for r in range(3):
-            result[POINT + r] = point[r]
-        result[HAS_POINT] = 1.0
+    if result.archive >= 0 and result.has_pair and not result.has_point:
+        put(result.point, touching_point(walk, to, hit))
+        result.has_point = True

@@ -10,10 +10,10 @@ from effect_rooms import INTERPRETED, Play
 from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
-from solidcloud.server.simulation.world import frame_walk
+from solidcloud.server.simulation.world import walker
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
-from solidcloud.server.simulation.world.frame_walk import FOLLOW, GROUND, SLIDE, STEP
+from solidcloud.server.simulation.world.walker import FOLLOW, GROUND, SLIDE, STEP
 
 FRAMES = 12 if INTERPRETED else 130
 
@@ -52,7 +52,7 @@ def test_frames_are_the_same_whoever_answers_their_queries(
     person = effect_rooms.person()
     with effect_rooms.play(case.archive, *effects, up=up) as play:
         plays = [play]
-        monkeypatch.setattr(frame_walk, "_ROWS", 2)
+        monkeypatch.setattr(walker, "_ROWS", 2)
         for _ in range(2):
             world = World(play.scene, play.world.file)
             plays.append(Play(play.scene, world, make_pipeline(play.world.file, world)))

@@ -8,8 +8,8 @@ With the effect `sweep`, a motion stops the skin before the first contact, at a 
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..motion.sweep_resident import END, LOWER, MIN_MOTION, POINT, skin_fraction
-from .walk_queries import (
+from ..motion.sweep_resident import MIN_MOTION, skin_fraction
+from .queries import (
     farthest_motion,
     first_hit,
     gives_way,
@@ -21,27 +21,8 @@ from .walk_queries import (
     pose_on_way,
     touching_point,
 )
-from .walk_state import (
-    BLOCKED,
-    BLOCKED_POSE,
-    CLEAR,
-    CONTACT,
-    FRAME_VERDICT,
-    HAS_END,
-    HAS_PAIR,
-    HAS_POINT,
-    HITS,
-    IS_CLEAR,
-    LEFT,
-    POSE,
-    REST,
-    TARGET,
-    UNKNOWN,
-    UNLOADED,
-    VERDICT,
-    pose_now,
-)
-from .walk_vectors import copy_pose
+from .state import CLEAR, CONTACT, UNKNOWN, blocked_pose, pose_now
+from .walk_vectors import copy_pose, same_pose, vector
 
 # First step back from a pose that turns out not to be clear [m], and its growth factor.
 FIRST_STEP_BACK, STEP_GROWTH = 1e-7, 4.0
@@ -50,34 +31,22 @@ MAX_PUSHES = 4
 
 
 @nb.njit(nogil=True, cache=True)
-def same_pose(one, other):
-    """Return whether two poses (4, 4) have the same bits."""
-    for r in range(4):
-        for c in range(4):
-            a, b = one[r, c], other[r, c]
-            if a != b or np.signbit(a) != np.signbit(b):
-                return False
-    return True
-
-
-@nb.njit(nogil=True, cache=True)
 def move_to(walk, pose):
     """Set the frame's pose (4, 4)."""
-    copy_pose(pose, walk.memory.poses[POSE])
+    copy_pose(pose, pose_now(walk))
 
 
 @nb.njit(nogil=True, cache=True)
 def record_hit(walk, hit, to):
     """Record the hit that ended a motion to a pose (4, 4)."""
     memory = walk.memory
-    result, numbers = memory.tape[hit], memory.numbers
-    if result[UNLOADED] != 0.0:
-        result[REST] = motion_left(walk, to)
-    memory.hits[numbers[HITS]] = hit
-    memory.normals[numbers[HITS], 0] = 0.0
-    numbers[HITS] += 1
-    if result[VERDICT] == UNKNOWN and numbers[FRAME_VERDICT] == CLEAR:
-        numbers[FRAME_VERDICT] = UNKNOWN
+    result, state = memory.tape[hit], memory.state[0]
+    if result.unloaded:
+        result.rest = motion_left(walk, to)
+    memory.hits[state.hits].row, memory.hits[state.hits].has_normal = hit, False
+    state.hits += 1
+    if result.verdict == UNKNOWN and state.verdict == CLEAR:
+        state.verdict = UNKNOWN
 
 
 @nb.njit(nogil=True, cache=True)
@@ -100,13 +69,13 @@ def settle_before(walk, to, fraction, proved):
 @nb.njit(nogil=True, cache=True)
 def _skin_share(walk, to, hit):
     """Return the share of the motion to a pose (4, 4) by which to stop before a hit, to keep the skin."""
-    skin, begin, result = walk.settings.skin, pose_now(walk), walk.memory.tape[hit]
+    skin, begin, result = walk.settings[0].skin, pose_now(walk), walk.memory.tape[hit]
     way = farthest_motion(walk, begin, to)
     if way <= 0.0 or skin <= 0.0:
         return 0.0
-    if result[HAS_PAIR] == 0.0:
+    if not result.has_pair:
         return skin / way
-    point = result[POINT : POINT + 3] if result[HAS_POINT] != 0.0 else touching_point(walk, to, hit)
+    point = vector(result.point) if result.has_point else touching_point(walk, to, hit)
     own, cloud = pair_of(walk, hit)
     return skin_fraction(begin, to, own, cloud, point, way, skin)
 
@@ -115,24 +84,25 @@ def _skin_share(walk, to, hit):
 def advance(walk, to):
     """Move towards a pose (4, 4) as far as nothing is touched; return the hit that ended the motion."""
     memory, hit = walk.memory, -1
-    leaves = memory.numbers[FRAME_VERDICT] == CONTACT  # the frame began in contact
-    if not (walk.settings.continuous or leaves):
+    leaves = memory.state[0].verdict == CONTACT  # the frame began in contact
+    if not (walk.settings[0].continuous or leaves):
         return _move_if_clear(walk, to)
     for _ in range(MAX_PUSHES):
         if same_pose(pose_now(walk), to):
             return -1
-        hit = first_hit(walk, to, walk.settings.tolerance, walk.settings.skin, False)
+        hit = first_hit(walk, to, walk.settings[0].tolerance, walk.settings[0].skin, False)
         if hit < 0:
             move_to(walk, to)
             return -1
         result = memory.tape[hit]
-        if result[HAS_END] != 0.0 and (leaves or not walk.bodies):
-            end = result[END:VERDICT].reshape(4, 4)
+        if result.has_end and (leaves or not walk.bodies):
+            end = np.empty((4, 4))
+            copy_pose(result.end, end)
             if not walk.bodies or is_clear(walk, end, True):
                 move_to(walk, end)
         else:
             keep_point(walk, to, hit)
-            fraction = result[LOWER]
+            fraction = result.lower
             settle_before(walk, to, fraction - _skin_share(walk, to, hit), fraction)
         if not gives_way(walk, hit, to):
             break
@@ -151,13 +121,13 @@ def _move_if_clear(walk, to):
         hit = hit_at(walk, to)
     if hit < 0:
         move_to(walk, to)
-        memory.numbers[IS_CLEAR] = 1
-        if memory.numbers[FRAME_VERDICT] == CONTACT:
-            memory.numbers[FRAME_VERDICT] = CLEAR
+        memory.state[0].clear = True
+        if memory.state[0].verdict == CONTACT:
+            memory.state[0].verdict = CLEAR
         return -1
-    memory.tape[hit, LOWER] = 1.0
+    memory.tape[hit].lower = 1.0
     keep_point(walk, to, hit)
-    memory.tape[hit, LOWER] = 0.0
+    memory.tape[hit].lower = 0.0
     record_hit(walk, hit, to)
     return hit
 
@@ -166,12 +136,12 @@ def _move_if_clear(walk, to):
 def follow_command(walk):
     """Move towards the commanded pose."""
     memory = walk.memory
-    hit = advance(walk, memory.poses[TARGET])
-    if hit >= 0 and memory.numbers[FRAME_VERDICT] == CONTACT:
+    hit = advance(walk, memory.target)
+    if hit >= 0 and memory.state[0].verdict == CONTACT:
         hit = _move_before_turn(walk, hit)
-    memory.numbers[BLOCKED] = hit
+    memory.state[0].blocked = hit
     if hit >= 0:
-        copy_pose(pose_now(walk), memory.poses[BLOCKED_POSE])
+        copy_pose(pose_now(walk), blocked_pose(walk))
     keep_rest(walk, 0.0)
 
 
@@ -181,7 +151,7 @@ def _move_before_turn(walk, hit):
 
     hit: that of the whole motion. Returns the hit that ends the motion, -1 for none.
     """
-    target, moved = walk.memory.poses[TARGET], pose_now(walk).copy()
+    target, moved = walk.memory.target, pose_now(walk).copy()
     turns = False
     for r in range(3):
         moved[r, 3] = target[r, 3]
@@ -189,7 +159,7 @@ def _move_before_turn(walk, hit):
             turns |= moved[r, c] != target[r, c]
     if not turns:
         return hit
-    walk.memory.numbers[HITS] -= 1
+    walk.memory.state[0].hits -= 1
     hit = advance(walk, moved)
     return hit if hit >= 0 else advance(walk, target)
 
@@ -198,6 +168,7 @@ def _move_before_turn(walk, hit):
 def keep_rest(walk, rose):
     """Record what is left of the motion command, after a climb by `rose` [m]."""
     memory = walk.memory
-    target, pose = memory.poses[TARGET], pose_now(walk)
+    target, pose = memory.target, pose_now(walk)
+    left = memory.state[0].left
     for r in range(3):
-        memory.values[LEFT + r] = target[r, 3] + rose * walk.settings.up[r] - pose[r, 3]
+        left[r] = target[r, 3] + rose * walk.settings[0].up[r] - pose[r, 3]

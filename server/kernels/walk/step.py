@@ -4,22 +4,10 @@ import numpy as np
 
 from ....schemas.kernels import compiling as nb
 from ..motion.sweep_resident import MIN_MOTION
-from .ground_search import lower_by, move_by, search_below
-from .stand_on_ground import DEAD_BAND
-from .walk_motions import keep_rest, move_to
-from .walk_queries import pair_of
-from .walk_state import (
-    BEGIN,
-    BLOCKED,
-    BLOCKED_POSE,
-    FRAME_VERDICT,
-    HAS_PAIR,
-    HITS,
-    STEPPED,
-    STOOD,
-    TARGET,
-    pose_now,
-)
+from .ground import DEAD_BAND, lower_by, move_by, search_below
+from .motions import keep_rest, move_to
+from .queries import pair_of
+from .state import blocked_pose, pose_now
 from .walk_vectors import copy_pose, divided, dot, lowest_height, minus, norm, place_of, times, vector
 
 # The climb must lead this much farther than sliding [m], and by this share of the remainder.
@@ -31,47 +19,47 @@ SLID_SHARE = 0.5
 @nb.njit(nogil=True, cache=True)
 def step_up(walk):
     """Climb the obstacle that stopped the motion command, if possible."""
-    memory, settings = walk.memory, walk.settings
-    numbers, up, hit = memory.numbers, vector(settings.up), memory.numbers[BLOCKED]
-    if hit < 0 or memory.inputs[STOOD] == 0.0 or memory.tape[hit, HAS_PAIR] == 0.0:
+    memory, settings, state = walk.memory, walk.settings[0], walk.memory.state[0]
+    up, hit = vector(settings.up), state.blocked
+    if hit < 0 or not memory.before[0].stood or not memory.tape[hit].has_pair:
         return
-    begin = place_of(memory.poses[BEGIN])
-    command = minus(place_of(memory.poses[TARGET]), begin)
+    begin = place_of(memory.begin)
+    command = minus(place_of(memory.target), begin)
     length = norm(command)
     if length < MIN_MOTION:
         return
     along = divided(command, length)
     so_far = dot(minus(place_of(pose_now(walk)), begin), along)
-    feet = lowest_height(walk.avatar.points, walk.avatar.radius, memory.poses[BLOCKED_POSE], up)
+    feet = lowest_height(walk.avatar.points, walk.avatar.radius, blocked_pose(walk), up)
     top = feet + settings.step
     low = _is_low(walk, hit, top)
     if not so_far > SLID_SHARE * length:
         # Beside a wall that is touched first, a step is touched while sliding.
-        for n in range(numbers[HITS]):
-            low |= _is_low(walk, memory.hits[n], top)
+        for n in range(state.hits):
+            low |= _is_low(walk, memory.hits[n].row, top)
     least = so_far + max(MIN_CLIMB_GAIN, MIN_CLIMB_GAIN_SHARE * (length - so_far))
     if not low or least >= length:  # walls
         return
-    before, hits, verdict = np.empty((4, 4)), numbers[HITS], numbers[FRAME_VERDICT]
+    before, hits, verdict = np.empty((4, 4)), state.hits, state.verdict
     copy_pose(pose_now(walk), before)
-    move_to(walk, memory.poses[BLOCKED_POSE])
+    move_to(walk, blocked_pose(walk))
     climbed, rose = _climb(walk, along, length, least)
     if climbed:
-        memory.values[STEPPED] = max(rose, 0.0)
+        state.stepped = max(rose, 0.0)
         keep_rest(walk, rose)
     else:
         move_to(walk, before)
-        numbers[FRAME_VERDICT] = verdict
-    numbers[HITS] = hits
+        state.verdict = verdict
+    state.hits = hits
 
 
 @nb.njit(nogil=True, cache=True)
 def _is_low(walk, hit, top):
     """Return whether a hit is at most at the height `top` [m], or without a place it is not."""
-    if walk.memory.tape[hit, HAS_PAIR] == 0.0:
+    if not walk.memory.tape[hit].has_pair:
         return False
     _, cloud = pair_of(walk, hit)
-    return not dot(cloud, vector(walk.settings.up)) > top
+    return not dot(cloud, vector(walk.settings[0].up)) > top
 
 
 @nb.njit(nogil=True, cache=True)
@@ -81,7 +69,7 @@ def _climb(walk, along, length, least):
     along: unit vector, horizontal direction.  length: [m].  least: least gain along it [m].
     Return whether the motion ends on ground that is not too high, and the height gained [m].
     """
-    settings, begin = walk.settings, place_of(walk.memory.poses[BEGIN])
+    settings, begin = walk.settings[0], place_of(walk.memory.begin)
     up, start = vector(settings.up), place_of(pose_now(walk))
     move_by(walk, times(settings.step, up), False)  # sliding avoids the bumps of the riser
     rose = dot(minus(place_of(pose_now(walk)), start), up)

@@ -1,9 +1,9 @@
 """Child processes that warm a scene, other parts first, while this process warms it.
 
 All share the folder of compiled kernels: one compiles a kernel and the others wait for it
-(schemas/kernels/kernel_files.py). Two processes therefore compile everything in about half the time.
-A process cannot do so with threads, because numba compiles one function at a time. The children start
-only once there is something to compile.
+(schemas/kernels/kernel_files.py). Two processes therefore compile everything in little more than half
+the time: what kernels of both call, both compile. A process cannot do so with threads, because numba
+compiles one function at a time. The children start only once there is something to compile.
 """
 
 import os
@@ -50,14 +50,18 @@ def warmed_in_parallel(what: Path) -> Iterator[None]:
 
 
 def main(path: str, last: int) -> None:
-    """Warm a scene, from the part before number `last` backwards.
+    """Warm an archive, from the part before number `last` backwards.
 
-    Errors are reported by the process that serves it.
+    Of a scene file this is the first archive: to make its effects compiles the kernels of their frames at
+    once, which the process that serves does. That process also reports errors.
     """
+    from ....schemas.scene.scene_file import read_scene
     from ....schemas.wire.warming_parts import PARTS
     from ...scene import Scene
 
-    with Scene.open(path) as scene:
+    what = Path(path)
+    archive = what if what.is_dir() else what.parent / read_scene(what).archives[0].path
+    with Scene.open(archive) as scene:
         scene.warm(*reversed(PARTS[last:] + PARTS[:last]))
 
 

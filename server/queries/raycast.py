@@ -66,7 +66,8 @@ def raycast_steps(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-    hit, normal = (np.full((len(world), 3), math.nan) for _ in range(2))
+    hit: NDArray[np.float64] = np.full((len(world), 3), math.nan)
+    normal: NDArray[np.float64] = np.full((len(world), 3), math.nan)
 
     def on_hits(which: NDArray[np.int64], best: ClosestHits) -> None:
         """Write origin + distance u, and the normal along t u - d, from the sphere's centre to the hit.

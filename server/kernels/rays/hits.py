@@ -59,7 +59,7 @@ class HitBatch(NamedTuple):
 
     origin: NDArray[np.int64]
     direction: NDArray[np.float64]
-    reach: int
+    reach: int | np.int64
     radius: int
 
 
@@ -410,7 +410,7 @@ def _search_voxel(scene, voxel, batch, i, near, best, scratch):
                     place -= 1
                 rows[place], bounds[place], keys[place] = row, bound, key
                 depth += 1
-        count = 0
+        count = np.int64(0)
         while depth > 0 and count == 0:
             depth -= 1
             row, above = rows[depth], bounds[depth]

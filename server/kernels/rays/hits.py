@@ -59,7 +59,7 @@ class HitBatch(NamedTuple):
 
     origin: NDArray[np.int64]
     direction: NDArray[np.float64]
-    reach: int
+    reach: int | np.int64
     radius: int
 
 

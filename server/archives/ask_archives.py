@@ -56,9 +56,12 @@ def hold_archives(
     try:
         for placed in archives:
             opened = placed.take()
-            held.append(HeldArchive(placed, opened, opened.data))
-            data = with_stop(opened.radius_model(radius_model), stop)
-            held[-1] = HeldArchive(placed, opened, data)
+            try:
+                data = with_stop(opened.radius_model(radius_model), stop)
+            except BaseException:
+                opened.release()
+                raise
+            held.append(HeldArchive(placed, opened, data))
     except BaseException:
         release(held)
         raise

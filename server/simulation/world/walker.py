@@ -357,10 +357,12 @@ class Walker:
         begin, target, pose = body.pose, frame.target, frame.pose
         seconds, fell, tolerance = float(frame.seconds), float(body.fall_speed), float(budget.tolerance)
         stood, clear, verdict = bool(body.on_ground), bool(frame.clear), int(frame.verdict)
-        blocks, bodies = bool(frame.obstacles), frame.obstacles[0].bodies if frame.obstacles else _NO_BODIES
-        wanted = 0
-        for obstacle in frame.obstacles:
-            wanted |= obstacle.wanted
+        obstacles, bodies, wanted, margin = frame.obstacles, _NO_BODIES, 0, 0.0
+        blocks = bool(obstacles)
+        if blocks:
+            bodies = obstacles[0].bodies
+            for obstacle in obstacles:
+                wanted |= obstacle.wanted
         with world as seen:
             each, alone, avatar = seen[0], world.is_alone, body.avatar
             data, residency, scratch = each.data, each.data.residency, thread.scratch_of(avatar)
@@ -371,14 +373,15 @@ class Walker:
             while True:
                 try:
                     # The bodies' lock comes first, as where an object is pushed through the scan.
+                    if blocks:
+                        margin = max([each.margin for each in obstacles])
                     with bodies.lock, residency.frozen():
                         self._code.call(
                             walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
                             self._settings, avatar.reference, scratch, thread.reference, held.reference,
                             data.arrays.stop, data.nothing_clear, alone, native, blocks, data.radius_units, tolerance,
                             budget.tolerance_units, squares, bodies.bounds, bodies.kinds, bodies.origin, wanted,
-                            bodies.row_of(body.name, user=True),
-                            max([each.margin for each in frame.obstacles], default=0.0),
+                            bodies.row_of(body.name, user=True), margin,
                         )  # fmt: skip
                         log, used = thread.log, thread.log.used.item()
                         if used:

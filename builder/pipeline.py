@@ -23,7 +23,7 @@ from ..schemas.archive.level import LEVEL_FOLDER
 from ..schemas.archive.voxel_grid import Lattice
 from ..schemas.archive.vtkhdf import PREVIEW_NAME
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
-from ..schemas.process.interrupts import check_interrupt
+from ..schemas.runtime.interrupts import check_interrupt
 from .build_limits import (
     ARCHIVE_BYTES_A_POINT,
     DENSE_POINTS,

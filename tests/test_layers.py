@@ -15,10 +15,11 @@ from source_imports import API, PACKAGES, ROOT, Import, all_imports, cycles, imp
 # Rooms of the same package that each room may import, lower rooms first; every entry is in use. "kernels" stands for
 # all its sub-rooms, except between these. Every room may import schemas.
 ALLOWED = {
-    "schemas/process": "errors.py",
-    "schemas/archive": "errors.py kernels process",
+    "schemas/runtime": "errors.py",
+    "schemas/kernels": "runtime",
+    "schemas/archive": "errors.py kernels runtime",
     "schemas/wire": "archive errors.py",
-    "schemas/scene": "archive errors.py process wire",
+    "schemas/scene": "archive errors.py runtime wire",
     "builder/kernels/neighbours": "kernels/points",
     "builder/build_limits.py": "config.py",
     "builder/run": "build_limits.py",
@@ -115,7 +116,7 @@ COMMANDS = ("server/cli", "server/report")
 # Library: the files, or the folders with a slash behind, that may import it.
 DOORS = {
     "h5py": (
-        "schemas/process/new_hdf5_file.py",
+        "schemas/runtime/new_hdf5_file.py",
         "schemas/archive/archive_writer.py",
         "schemas/archive/archive.py",
         "schemas/archive/vtkhdf.py",
@@ -128,8 +129,8 @@ DOORS = {
         "server/zenoh_server/",
         "server/report/load/users/",
     ),
-    "numba": ("schemas/kernels/compiling.py", "schemas/kernels/kernel_dispatcher.py"),
-    "llvmlite": ("schemas/kernels/compiling.py", "schemas/kernels/kernel_dispatcher.py"),
+    "numba": ("schemas/runtime/compiling.py", "schemas/runtime/kernel_dispatcher.py"),
+    "llvmlite": ("schemas/runtime/compiling.py", "schemas/runtime/kernel_dispatcher.py"),
     "laspy": ("builder/synthetic/write.py", "builder/export/las_export.py"),
     "lazrs": ("builder/sources/formats/las.py",),
     "pye57": ("builder/sources/formats/e57.py", "builder/synthetic/write.py"),
@@ -293,7 +294,7 @@ def test_every_room_says_what_it_may_import() -> None:
         ),
         ("server/kernels/core/scene_arrays.py", "from ..rays.hits import STACK", "no other room"),
         ("server/scene.py", "from . import queries", "as a whole"),
-        ("server/scene.py", "import h5py", "its door is schemas/process/new_hdf5_file.py"),
+        ("server/scene.py", "import h5py", "its door is schemas/runtime/new_hdf5_file.py"),
         ("builder/sources/formats/ply.py", "laspy = reader_library('laspy', path)", "its door is"),
         ("server/scene.py", "import requests", "has no door"),
         (
@@ -305,7 +306,7 @@ def test_every_room_says_what_it_may_import() -> None:
         (
             "server/kernels/collide/collide_poses.py",
             "import numba as nb",
-            "its door is schemas/kernels/compiling.py",
+            "its door is schemas/runtime/compiling.py",
         ),
     ],
 )
@@ -321,7 +322,7 @@ def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
         ("server/avatars/avatar_file.py", "from ...builder.sources.placed_scan import METRES"),
         ("server/report/walk/demo_walk.py", "from ....builder.pipeline import build_archive"),
         ("server/cli/main.py", "from ...builder.passes.verify import verify_archive"),
-        ("server/kernels/collide/collide_poses.py", "from ....schemas.kernels import compiling as nb"),
+        ("server/kernels/collide/collide_poses.py", "from ....schemas.runtime import compiling as nb"),
         ("server/kernels/collide/collide_poses.py", "from ..core.scene_arrays import LANES"),
         ("builder/pipeline.py", "from ..schemas.wire import key_expressions"),
     ],

@@ -23,7 +23,7 @@ from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.level import LEVEL_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
-from ...schemas.process.new_file import sync_path
+from ...schemas.runtime.new_file import sync_path
 from ..build_limits import bytes_beside_records, readers_that_fit
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS

@@ -15,7 +15,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from ...schemas.kernels.morton import morton_decode
-from ...schemas.process.new_file import new_file
+from ...schemas.runtime.new_file import new_file
 from ..build_limits import is_dense
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS

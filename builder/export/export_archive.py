@@ -21,7 +21,7 @@ from ...schemas.archive.index import Header
 from ...schemas.archive.voxel_grid import MAX_COORDINATE, Lattice
 from ...schemas.archive.vtkhdf import vtk_file
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_path
+from ...schemas.runtime.new_file import new_path
 from ..run.executor import Progress, Silent
 from ..voxel.record_points import PointBlock, iter_points, read_columns, record_columns, stored_columns
 from .export_contents import Contents

@@ -17,7 +17,7 @@ from ...schemas.archive.codec import encode_voxel
 from ...schemas.archive.index import SHARD_FOLDER, VOXEL_DTYPE, shard_name
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel_grid import Lattice
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..build_limits import VOXEL_BYTES_A_POINT, is_dense, shard_points
 from ..config import BuildConfig
 from ..resume.kept_work import BuildDirectory, ShardIntact, Work, run_unfinished

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.voxel import CELL_BITS
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from .. import build_limits
 from ..config import MAX_CELL_POINTS, BuildConfig
 from ..kernels.points.octree_cells import count_capacities, is_ascending, voxel_codes

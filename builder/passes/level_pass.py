@@ -23,8 +23,8 @@ from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel import VoxelData
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
 from ...schemas.errors import CorruptError
-from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_file import sync_path
+from ...schemas.runtime.interrupts import check_interrupt
+from ...schemas.runtime.new_file import sync_path
 from ..config import BuildConfig
 from ..run.executor import Executor, Progress, Silent, run_units
 from ..voxel.level_voxel import LevelVoxel, level_voxels

@@ -11,8 +11,8 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from ...schemas.errors import CorruptError
-from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_hdf5_file import new_hdf5_file
+from ...schemas.runtime.interrupts import check_interrupt
+from ...schemas.runtime.new_hdf5_file import new_hdf5_file
 from ..build_limits import MAX_PREVIEW_POINTS, PREVIEW_PART, WHOLE_PREVIEW_POINTS
 from ..kernels.points.voxel_records import first_of_each, point_hashes
 from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.voxel_grid import KEY_BIAS, MAX_COORDINATE, Lattice, voxel_keys
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.spool_rows import (

@@ -14,7 +14,7 @@ from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header
 from ...schemas.archive.level import LEVEL_FOLDER, open_level
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import last_unenclosing_node, measure_points, position_hash_sum
 from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges, worker_count

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.codec import encode_voxel
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.occupied_cubes import FREE, find_cube_points, insert_all
 from ..passes.spool_pass import usable

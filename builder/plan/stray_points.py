@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..kernels.points.cube_components import (
     add_cubes,
     count_around,

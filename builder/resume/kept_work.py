@@ -27,8 +27,8 @@ from typing import Any, Generic, TypeVar
 from ...schemas.archive.archive_writer import file_checksum
 from ...schemas.archive.index import SHARD_FOLDER
 from ...schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
-from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_file import TEMPORARY_SUFFIX, is_temporary, new_file, remove_temporaries
+from ...schemas.runtime.interrupts import check_interrupt
+from ...schemas.runtime.new_file import TEMPORARY_SUFFIX, is_temporary, new_file, remove_temporaries
 from ..run.executor import Executor, Progress
 from ..spool.run_files import RunSums, is_run_damaged, run_sizes
 from .build_identity import check_same

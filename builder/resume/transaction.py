@@ -17,8 +17,8 @@ from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER
 from ...schemas.archive.level import LEVEL_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_path
-from ...schemas.process.os_errors import os_error_words
+from ...schemas.runtime.new_file import is_temporary, remove_temporaries, sync_path
+from ...schemas.runtime.os_errors import os_error_words
 from ..build_limits import jobs_that_fit, memory_share
 from ..config import BuildConfig
 from ..run.executor import Executor, ProcessExecutor, Progress, Silent, worker_count

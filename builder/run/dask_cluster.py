@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.interrupts import blocking_sigint, check_interrupt
+from ...schemas.runtime.interrupts import blocking_sigint, check_interrupt
 from ..build_limits import CLUSTER_WORKER_KILLED, cluster_worker_limit
 from .executor import ASK_SECONDS, Progress, Result, Unit, results_in_order
 from .software_versions import software_versions

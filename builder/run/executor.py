@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.process.interrupts import blocking_sigint, check_interrupt
+from ...schemas.runtime.interrupts import blocking_sigint, check_interrupt
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 Handle = TypeVar("Handle")
 
-_COMPILING = logging.getLogger("solidcloud.schemas.kernels.compiling")
+_COMPILING = logging.getLogger("solidcloud.schemas.runtime.compiling")
 # With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
 # saves.
 POINTS_WORTH_A_PROCESS = 4_000_000

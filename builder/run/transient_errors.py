@@ -7,7 +7,7 @@ import errno
 from pathlib import Path
 
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 
 # Errors of a disk, a network or an overloaded machine.
 TRANSIENT = frozenset(

@@ -3,7 +3,7 @@
 from collections import Counter
 
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from .common.colours import CLASSIFICATION
 from .common.scan import Scan
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, ScanError
-from ...schemas.process.interrupts import check_interrupt
+from ...schemas.runtime.interrupts import check_interrupt
 from ..run.executor import Progress, Silent
 from ..run.transient_errors import raise_transient
 from .class_counts import count_classes, counted_points

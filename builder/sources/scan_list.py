@@ -18,8 +18,8 @@ import tomli_w
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_file
-from ...schemas.process.text_encoding import decode_text
+from ...schemas.runtime.new_file import new_file
+from ...schemas.runtime.text_encoding import decode_text
 from .common.units import DEGREES, EXPECTED_UNITS, UNKNOWN, axis_metres
 from .placed_scan import TURNS
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive_writer import file_checksum
 from ...schemas.archive.voxel_grid import Lattice, voxel_coordinates
 from ...schemas.errors import CorruptError
-from ...schemas.process.new_file import new_file
+from ...schemas.runtime.new_file import new_file
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS, content_sum
 from ..kernels.points.octree_cells import voxel_codes

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import CorruptError
-from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_file import TEMPORARY_SUFFIX
+from ...schemas.runtime.interrupts import check_interrupt
+from ...schemas.runtime.new_file import TEMPORARY_SUFFIX
 from .run_files import RUN_SUFFIX, read_directory, row_codes
 
 # Suffix of the file of all merged directories.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_file
+from ...schemas.runtime.new_file import new_file
 
 # Height that the proportions are given for [m]; other heights scale the whole figure.
 HEIGHT = 1.75

@@ -19,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_path
+from ...schemas.runtime.new_file import new_path
 from .figure import figure_points
 from .scanner import (
     LATTICE,

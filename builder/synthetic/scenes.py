@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_path
+from ...schemas.runtime.new_file import new_path
 from .facade import SILL, build_facade
 from .scanner import (
     LATTICE,

@@ -13,7 +13,7 @@ import numpy as np
 import pye57
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_path
+from ...schemas.runtime.new_file import new_path
 from .scanner import LATTICE, SimulatedScan
 
 SUFFIXES = (".laz", ".las", ".e57")

@@ -17,7 +17,7 @@ from h5py import h5a, h5d, h5l, h5o, h5s
 from numpy.typing import NDArray
 
 from ..errors import CorruptError, FormatError
-from ..process.interrupts import check_interrupt
+from ..runtime.interrupts import check_interrupt
 from .codec import (
     OPTIONAL_COLUMNS,
     DecompressedRecord,

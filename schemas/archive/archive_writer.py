@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..process.interrupts import check_interrupt
-from ..process.new_file import new_path
-from ..process.new_hdf5_file import hdf5_file, new_hdf5_file
+from ..runtime.interrupts import check_interrupt
+from ..runtime.new_file import new_path
+from ..runtime.new_hdf5_file import hdf5_file, new_hdf5_file
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .index import (
     DATASETS,

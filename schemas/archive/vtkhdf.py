@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..process.new_hdf5_file import NewHdf5File, hdf5_file
+from ..runtime.new_hdf5_file import NewHdf5File, hdf5_file
 
 PREVIEW_NAME = "preview.vtkhdf"
 

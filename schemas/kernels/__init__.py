@@ -1,5 +1,5 @@
-"""Numba kernels of the file format, and how all kernels are compiled and cached.
+"""Numba kernels of the file format.
 
-May import nothing of the package.
-Begin with compiling.py, the only module that imports numba.
+May import schemas.runtime.
+Begin with record_rows.py.
 """

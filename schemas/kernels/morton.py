@@ -7,7 +7,7 @@ halving the gap between groups at each line).
 import numpy as np
 from numpy.typing import NDArray
 
-from . import compiling as nb
+from ..runtime import compiling as nb
 
 
 def _spread(value):

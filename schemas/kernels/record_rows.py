@@ -11,7 +11,7 @@ element.
 
 import numpy as np
 
-from . import compiling as nb
+from ..runtime import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

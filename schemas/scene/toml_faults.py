@@ -17,7 +17,7 @@ import msgspec
 from msgspec import inspect
 
 from ..errors import BadRequestError
-from ..process.text_encoding import decode_text
+from ..runtime.text_encoding import decode_text
 
 _T = TypeVar("_T")
 

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.process.visible_text import visible
+from ...schemas.runtime.visible_text import visible
 from .clash_check import CheckedPath
 from .clash_list import Clash
 from .clash_viewpoint import FIELD_OF_VIEW, Viewpoint

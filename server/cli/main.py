@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import typer
 
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.interrupts import deferring_interrupts
-from ...schemas.process.os_errors import os_error_line
-from ...schemas.process.own_command import NAME, path_advice
-from ...schemas.process.visible_text import show_all_output
+from ...schemas.runtime.interrupts import deferring_interrupts
+from ...schemas.runtime.os_errors import os_error_line
+from ...schemas.runtime.own_command import NAME, path_advice
+from ...schemas.runtime.visible_text import show_all_output
 from .commands import accuracy_command as accuracy
 from .commands import doctor_command as doctor
 from .commands import loadtest_command as loadtest

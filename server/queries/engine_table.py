@@ -25,9 +25,9 @@ from .collide import collide
 from .contacts import contacts
 from .distance import distance
 from .objects import objects
+from .one_item import collide_fast, distance_fast, sweep_fast
 from .raycast import raycast
 from .request import EXACT, QueryBudget
-from .resident_fast_path import collide_fast, distance_fast, sweep_fast
 from .scene_data import SceneData
 from .sweep import sweep
 from .within import within

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
-from ...schemas.process.os_errors import write_error_words
+from ...schemas.runtime.os_errors import write_error_words
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.encoding import JSON, avatar_digest, encode
 from ...schemas.wire.key_expressions import User

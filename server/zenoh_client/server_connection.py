@@ -26,7 +26,7 @@ from ...schemas.errors import (
     UnknownSceneError,
     error_from_code,
 )
-from ...schemas.process.own_command import own_command
+from ...schemas.runtime.own_command import own_command
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ScenesAnswer

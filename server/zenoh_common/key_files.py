@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import new_path
+from ...schemas.runtime.new_file import new_path
 from .endpoints import canonical
 
 log = logging.getLogger(__name__)

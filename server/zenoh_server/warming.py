@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from ...schemas.errors import BusyError
-from ...schemas.kernels.compiling import has_compiled
+from ...schemas.runtime.compiling import has_compiled
 from ...schemas.wire.warming_parts import PARTS
 from ..runtime.stop_flag import start_deadlines
 from ..scene_interface import ServedScene

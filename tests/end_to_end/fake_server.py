@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.kernels import compiling
+from solidcloud.schemas.runtime import compiling
 from solidcloud.schemas.scene.effect_table import MOTION_VERSION
 from solidcloud.schemas.scene.scene_file import SceneFile, SceneLimits, scene_of
 from solidcloud.schemas.wire.answers import (

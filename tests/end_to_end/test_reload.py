@@ -19,7 +19,7 @@ import synthetic_scans
 from frozen_processes import freeze
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
-from solidcloud.schemas.process.own_command import own_command
+from solidcloud.schemas.runtime.own_command import own_command
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.scene_messages import ReloadAnswer
 from solidcloud.schemas.wire.warming_parts import READY_LINE

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_server import FloorScene, floor_simulation
-from solidcloud.schemas.process.own_command import own_command
+from solidcloud.schemas.runtime.own_command import own_command
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server import client as client_module

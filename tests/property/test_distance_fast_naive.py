@@ -19,7 +19,7 @@ from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.wire.answers import DistanceAnswers
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.resident_fast_path import MAX_FAST_REACH, distance_fast
+from solidcloud.server.queries.one_item import MAX_FAST_REACH, distance_fast
 from solidcloud.server.queries.scene_data import SceneData
 from solidcloud.server.scene import Scene
 

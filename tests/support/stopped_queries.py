@@ -12,9 +12,9 @@ from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.distance_per_scan import separation_per_scan
 from solidcloud.server.queries.objects import objects
+from solidcloud.server.queries.one_item import collide_fast, distance_fast
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.request import QueryBudget, ask_until_stopped
-from solidcloud.server.queries.resident_fast_path import collide_fast, distance_fast
 from solidcloud.server.queries.scene_data import SceneData, with_stop
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within

@@ -8,7 +8,7 @@ and the 26 around it, nine runs of three cells.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..points.octree_cells import first_at_least
 
 

@@ -7,7 +7,7 @@ that it must open afterwards.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 BLOCK = 16
 FAN = 8

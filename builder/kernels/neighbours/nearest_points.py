@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.record_rows import LANES
+from ....schemas.runtime import compiling as nb
 from ..points.voxel_records import U, read_leaf
 
 FAR = np.int64(1) << np.int64(62)

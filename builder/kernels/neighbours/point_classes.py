@@ -10,7 +10,7 @@ plane through them, finds the same rims but needs an eigenvector.
 import numpy as np
 
 from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .nearest_neighbours import STACK, closest_distinct
 
 # Number of closest distinct points considered.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Points hashed at a time, column by column: the working set stays in the L1 cache, and the compiler
 # vectorises the loops: 0.5 ns a point of three columns, against 16 ns point by point (one core with

@@ -6,7 +6,7 @@ A table of cubes consists of `cubes` (2^b, 3) int32, coordinates relative to an 
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Maximum coordinate of a cube relative to the origin, either way: 10^5 km with cubes of 0.1 m.
 # Points beyond it are counted as if at the limit.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # A reference copies at most this many bytes, from at most this far back [liblzf, lzf_d.c].
 LONGEST_COPY = 264

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Free slot of a voxel table: no key is negative.
 FREE = np.int64(-1)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
+from ....schemas.runtime import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

@@ -6,8 +6,8 @@ the steps. The compiler can then vectorise every loop without branches.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code, morton_position
+from ....schemas.runtime import compiling as nb
 from .content_hash import mix_column, mixed_sum
 
 # Points per round of all steps.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.record_rows import LANES
+from ....schemas.runtime import compiling as nb
 from .content_hash import mix
 
 U = np.uint64

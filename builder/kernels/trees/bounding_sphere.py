@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Steps of the centre's iteration. Ratio of the radius to that of the minimal ball: see
 # tests/hard_cases/test_bounds.py, at most 1.25 on leaf blocks. Large sets get fewer steps, because

@@ -13,7 +13,7 @@ slab, count, axis, block_low.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .bounding_sphere import (
     LARGE_STEPS,
     MOMENTS,

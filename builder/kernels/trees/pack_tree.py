@@ -11,7 +11,7 @@ see schemas/kernels/record_rows.py.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Maximum bins of the histogram in which a median is located.
 BINS = 256

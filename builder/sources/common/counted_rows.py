@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check_interrupt
-from ....schemas.process.text_encoding import UTF8_MARK
+from ....schemas.runtime.interrupts import check_interrupt
+from ....schemas.runtime.text_encoding import UTF8_MARK
 from .colours import INTENSITY, RGB, whole_bytes
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
 from .text_rows import (

@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check_interrupt
+from ....schemas.runtime.interrupts import check_interrupt
 from .scan import BLOCK_BYTES, scan_error
 
 # Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import MAX_COORDINATE
 from ....schemas.errors import ScanError, SolidcloudError
-from ....schemas.process.interrupts import check_interrupt
+from ....schemas.runtime.interrupts import check_interrupt
 from .colours import CLASS, CLASSIFICATION, class_counts
 
 # A block of 2^18 points is 6 MiB of float64: large enough to hide the cost of one round of the

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import ScanError
-from ....schemas.process.interrupts import check_interrupt
-from ....schemas.process.text_encoding import UTF8_MARK, is_utf16
+from ....schemas.runtime.interrupts import check_interrupt
+from ....schemas.runtime.text_encoding import UTF8_MARK, is_utf16
 from .scan import scan_error
 
 # 4 MiB of text is about 130,000 rows of three numbers. In the worst case ("1 1 1 ...") it is 2 M

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check_interrupt
+from ....schemas.runtime.interrupts import check_interrupt
 from ..common.scan import (
     BLOCK_BYTES,
     BLOCK_POINTS,

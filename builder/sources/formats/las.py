@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
+from ....schemas.runtime.interrupts import blocking_interrupts, check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, SYNTHETIC, WITHHELD, class_counts
 from ..common.records import read_records
 from ..common.scan import (

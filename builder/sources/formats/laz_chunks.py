@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ....schemas.errors import ScanError
-from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
+from ....schemas.runtime.interrupts import blocking_interrupts, check_interrupt
 from ..common.scan import damaged_error, library_errors, scan_error
 
 CHUNKED = 2  # the compressor of point formats 0 to 5

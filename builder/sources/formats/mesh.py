@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ....schemas.process.text_encoding import UTF8_MARK, is_utf16
+from ....schemas.runtime.text_encoding import UTF8_MARK, is_utf16
 from ..common.records import check_end, read_records
 from ..common.scan import (
     Scan,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check_interrupt
+from ....schemas.runtime.interrupts import check_interrupt
 from ...kernels.points.lzf_decoder import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
 from ..common.scan import damaged_error
 

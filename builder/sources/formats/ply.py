@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check_interrupt
+from ....schemas.runtime.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, RGB, stack_channels, whole_bytes
 from ..common.records import check_end, read_records
 from ..common.scan import (

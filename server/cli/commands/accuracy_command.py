@@ -26,7 +26,7 @@ def accuracy(
     """
     import tempfile
 
-    from ....schemas.process.os_errors import naming_write_errors
+    from ....schemas.runtime.os_errors import naming_write_errors
 
     with needs_extra("made"):
         from ...report.accuracy.accuracy_report import run as measure

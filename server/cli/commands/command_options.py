@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ....schemas.errors import BadRequestError, SolidcloudError
-from ....schemas.process.interrupts import (
+from ....schemas.runtime.interrupts import (
     Interrupted,
     check_interrupt,
     deferring_interrupts,
     interrupt_pending,
     stop_insisting,
 )
-from ....schemas.process.own_command import with_own_command
+from ....schemas.runtime.own_command import with_own_command
 
 if TYPE_CHECKING:
     import numpy as np

@@ -78,7 +78,7 @@ def loadtest(
     or a section ended early; missed targets do not matter.
     """
     from ....schemas.errors import BadRequestError
-    from ....schemas.process.os_errors import naming_write_errors
+    from ....schemas.runtime.os_errors import naming_write_errors
 
     with needs_extra("report"):
         from ...report.common.sphere_pictures import load_pyplot

@@ -35,7 +35,7 @@ def new(
     import shlex
     import sys
 
-    from ....schemas.process.own_command import own_command
+    from ....schemas.runtime.own_command import own_command
     from ..scene_files.scene_new import new_scene
 
     wanted = [effect.strip() for effect in effects.split(",") if effect.strip()]

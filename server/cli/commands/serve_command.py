@@ -91,7 +91,7 @@ def serve(
     import sys
     from contextlib import ExitStack
 
-    from ....schemas.kernels.compiling import has_compiled, kernel_files
+    from ....schemas.runtime.compiling import has_compiled, kernel_files
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key

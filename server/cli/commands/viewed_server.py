@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ....schemas.errors import BadRequestError, SolidcloudError
-from ....schemas.process.text_encoding import decode_text
+from ....schemas.runtime.text_encoding import decode_text
 from ....schemas.scene.effect_table import effect_name
 from ....schemas.scene.scene_file import parse_scene, read_scene, scene_name
 from ....schemas.wire.warming_parts import SERVING_WORDS

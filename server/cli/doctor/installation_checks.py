@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from importlib import metadata
 
-from ....schemas.process.own_command import NAME, own_command, path_advice
+from ....schemas.runtime.own_command import NAME, own_command, path_advice
 from .check import Check, Status, fine
 
 # What each optional extra of pyproject.toml is for; the extras for development are left out.
@@ -105,7 +105,7 @@ def _inner_versions() -> dict[str, str]:
     if llvmlite := _installed("llvmlite"):
         found["numba"] = f"llvmlite {llvmlite}"
     try:
-        from ....schemas.process.new_hdf5_file import hdf5_version
+        from ....schemas.runtime.new_hdf5_file import hdf5_version
 
         found["h5py"] = f"HDF5 {hdf5_version()}"
     except (ImportError, OSError) as error:

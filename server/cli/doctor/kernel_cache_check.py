@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ....schemas.kernels import kernel_files
-from ....schemas.kernels.kernel_files import KernelFiles, default_folder
+from ....schemas.runtime import kernel_files
+from ....schemas.runtime.kernel_files import KernelFiles, default_folder
 from ..output.console import bytes_text
 from .check import Check, Status, fine
 

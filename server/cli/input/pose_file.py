@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError, ScanError
-from ....schemas.process.new_file import new_path
-from ....schemas.process.text_encoding import decode_text
+from ....schemas.runtime.new_file import new_path
+from ....schemas.runtime.text_encoding import decode_text
 
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")

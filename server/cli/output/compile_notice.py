@@ -1,7 +1,7 @@
 """Lines on standard error while kernels are compiled, which happens once on a machine.
 
 The folder of compiled kernels is watched, because worker processes compile too: a process marks
-there what it compiles, and other processes wait for it (schemas/kernels/kernel_files.py). Nothing
+there what it compiles, and other processes wait for it (schemas/runtime/kernel_files.py). Nothing
 is printed if all kernels are there, or within the first second.
 """
 
@@ -96,10 +96,10 @@ class CompileNotice:
 def compile_notices() -> Iterator[None]:
     """Print lines on standard error while kernels are compiled in this block, by any process.
 
-    They replace the messages about this process alone (schemas/kernels/compiling.py).
+    They replace the messages about this process alone (schemas/runtime/compiling.py).
     """
     ended = threading.Event()
-    own = logging.getLogger("solidcloud.schemas.kernels.compiling")
+    own = logging.getLogger("solidcloud.schemas.runtime.compiling")
     level = own.level
     own.setLevel(logging.ERROR)
 
@@ -109,7 +109,7 @@ def compile_notices() -> Iterator[None]:
         if ended.wait(_LOOK_SECONDS):
             return
         # Imported here: most commands end before.
-        from ....schemas.kernels.kernel_files import default_folder
+        from ....schemas.runtime.kernel_files import default_folder
 
         notice = CompileNotice(default_folder(os.environ.get("NUMBA_CACHE_DIR", "")), _print)
         while not ended.wait(_LOOK_SECONDS):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from ....schemas.process.own_command import with_own_command
+from ....schemas.runtime.own_command import with_own_command
 from .terminal import Terminal
 
 if TYPE_CHECKING:

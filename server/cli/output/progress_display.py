@@ -16,8 +16,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID
 from rich.table import Column
 from rich.text import Text
 
-from ....schemas.process.interrupts import check_interrupt
-from ....schemas.process.visible_text import show_all_output
+from ....schemas.runtime.interrupts import check_interrupt
+from ....schemas.runtime.visible_text import show_all_output
 from .terminal import Terminal
 
 # Rates average over this window: work completes in chunks of a second or two, and disk speed

@@ -5,7 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from ....schemas.process.visible_text import visible
+from ....schemas.runtime.visible_text import visible
 
 
 class Terminal(Console):

@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from ....schemas.process.visible_text import visible
+from ....schemas.runtime.visible_text import visible
 from ....schemas.wire.stats import StatsAnswer, UserStats
 from .console import bytes_text
 from .terminal import Terminal

@@ -14,8 +14,8 @@ import numpy as np
 from ....builder.synthetic.figure import HEIGHT, figure_points
 from ....schemas.archive.radius_model import STORED_MODELS
 from ....schemas.errors import BadRequestError, SolidcloudError
-from ....schemas.process.new_file import new_file
-from ....schemas.process.os_errors import write_error_words
+from ....schemas.runtime.new_file import new_file
+from ....schemas.runtime.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, SceneFile, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
 from ...archives.scene_info import describe

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import CorruptError, SolidcloudError
-from ....schemas.kernels.kernel_files import KernelFiles, default_folder
+from ....schemas.runtime.kernel_files import KernelFiles, default_folder
 from ....schemas.wire.answers import Verdict
 from .child_processes import end_with_parent, lifeline
 

@@ -1,7 +1,7 @@
 """Child processes that warm a scene, other parts first, while this process warms it.
 
 All share the folder of compiled kernels: one compiles a kernel and the others wait for it
-(schemas/kernels/kernel_files.py). Two processes therefore compile everything in little more than half
+(schemas/runtime/kernel_files.py). Two processes therefore compile everything in little more than half
 the time: what kernels of both call, both compile. A process cannot do so with threads, because numba
 compiles one function at a time. The children start only once there is something to compile.
 """
@@ -22,7 +22,7 @@ def warmed_in_parallel(what: Path) -> Iterator[None]:
 
     what: an archive or a scene file. The children are stopped at the end of the block.
     """
-    from ....schemas.kernels.compiling import on_first_compilation
+    from ....schemas.runtime.compiling import on_first_compilation
     from ....schemas.wire.warming_parts import PARTS
 
     children: list[subprocess.Popen[bytes]] = []

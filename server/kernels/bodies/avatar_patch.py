@@ -7,7 +7,7 @@ heights. The sums for the normal are integers.
 import numpy as np
 
 from ....schemas.archive.voxel import MAX_LEVELS
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.normal_codes import add_sums
 

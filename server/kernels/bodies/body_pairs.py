@@ -15,7 +15,7 @@ centre of one of the two leaf nodes, with a certified band in which integers dec
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.node_overlap import U32
 from ..core.placed_avatar import MAX_REACH_UNITS, largest_term, place, to_units
 from ..core.scene_arrays import LANES, stopped

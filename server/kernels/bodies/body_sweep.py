@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import largest_term, place, to_units
 from ..core.scene_arrays import LANES, stopped

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code

@@ -23,7 +23,7 @@ children saved a tenth of these visits and no time.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import (

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK, U32, lanes_meet, next_near, nodes_meet, sphere_is_near
 from ..core.placed_avatar import node_reach, pair_in_reach, place_block_once, place_node

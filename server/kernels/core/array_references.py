@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .placed_avatar import Avatar
 from .reach import VoxelTree
 from .scene_arrays import SceneArrays

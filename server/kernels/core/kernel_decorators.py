@@ -12,7 +12,7 @@ whole arrays.
 
 from typing import Any
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Given by name, because numba's own types omit this option: its underscore marks it as subject to
 # change. Without it, kernels are slower and equally correct.

@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
 from .scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 

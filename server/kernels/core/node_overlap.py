@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.voxel import MAX_LEVELS
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
 from .node_boxes import box_square, has_box
 from .placed_avatar import pad_list

@@ -25,7 +25,7 @@ from fractions import Fraction
 import numpy as np
 
 from ....schemas.errors import BadRequestError
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 
 # Largest reach [m]. Points farther apart do not belong to one surface.
 MAX_NORMAL_REACH = 1.0

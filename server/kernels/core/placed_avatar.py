@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel import MAX_LEVELS
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_no_refcount
 from .scene_arrays import LANES
 

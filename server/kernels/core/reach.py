@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
 from .scene_arrays import ROWS_AT_ONCE, stopped
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
 from ....schemas.archive.voxel import MAX_LEAF
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.rigid_pose import RIGID_TOLERANCE
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_no_refcount
 from .placed_avatar import MAX_REACH_UNITS, largest_term, place
 from .reach import REACH_STACK, VoxelLists, list_item, unknown_near

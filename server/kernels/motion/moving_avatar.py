@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RADIUS_CLASSES
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.placed_avatar import Avatar, largest_term, place

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import place, to_units
 from ..core.reach import INFINITE, MISSING, NOT_HELD, state_of

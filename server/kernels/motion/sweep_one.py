@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.scene_arrays import SceneArrays
 from .sweep_resident import sweep_resident
 from .sweep_segments import find_unknown_regions

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import reference
 from ..core.kernel_decorators import njit_no_refcount

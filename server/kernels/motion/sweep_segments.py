@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import largest_term, place
 from ..core.reach import INFINITE, REACH_STACK, entry_fraction, list_item

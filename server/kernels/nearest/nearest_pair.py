@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_boxes import box_square, has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, STACK, U32, make_thresholds

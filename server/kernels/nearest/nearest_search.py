@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_overlap import (

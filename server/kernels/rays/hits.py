@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel import MAX_LEVELS
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import enter_box, has_box

@@ -8,7 +8,7 @@ exactly; integers decide each point.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
 from ..core.normal_codes import add_sums

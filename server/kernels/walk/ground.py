@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .motions import advance, move_to, record_hit, settle_before
 from .normals import hit_normal, scan_normal
 from .queries import first_hit, lands, nearest_point, pair_of

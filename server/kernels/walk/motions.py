@@ -7,7 +7,7 @@ With the effect `sweep`, a motion stops the skin before the first contact, at a 
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..motion.sweep_resident import MIN_MOTION, skin_fraction
 from .queries import (
     farthest_motion,

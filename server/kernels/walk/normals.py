@@ -21,7 +21,7 @@ sheet's normal, and uneven spacing is not taken for a border.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..bodies.avatar_patch import lowest_heights
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.reach import all_resident

@@ -5,7 +5,7 @@ A hit is the number of its row of the tape; -1 stands for none.
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..bodies.body_pairs import find_near_bodies
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID

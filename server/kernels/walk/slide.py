@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.normal_codes import MAX_NORMAL_REACH
 from .motions import advance, keep_rest, move_to

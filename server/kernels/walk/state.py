@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference, record_type, reference
 from ..motion.sweep_resident import SWEPT, MotionScratch

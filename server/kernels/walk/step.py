@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..motion.sweep_resident import MIN_MOTION
 from .ground import DEAD_BAND, lower_by, move_by, search_below
 from .motions import keep_rest, move_to

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from .ground import stand_on_ground
 from .motions import follow_command
 from .slide import slide_command

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ....schemas.kernels import compiling as nb
+from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 
 

@@ -16,8 +16,8 @@ from typing import Any
 
 from ....builder.run.executor import Progress
 from ....schemas.archive.archive import Archive
-from ....schemas.process.new_file import new_file
-from ....schemas.process.os_errors import check_writable
+from ....schemas.runtime.new_file import new_file
+from ....schemas.runtime.os_errors import check_writable
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 from ..common.machine import BUSY, cores, cpu_name

@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from ....schemas.process.visible_text import visible
+from ....schemas.runtime.visible_text import visible
 from ...cli.output.terminal import Terminal
 
 # Mean number of other processes that wanted a core. Above it, long turns suffer more than short

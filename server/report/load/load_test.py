@@ -21,8 +21,8 @@ from ....builder.run.executor import Progress
 from ....builder.synthetic.figure import figure_points
 from ....builder.synthetic.truth import SceneTruth, read_truth
 from ....schemas.errors import SolidcloudError
-from ....schemas.process.interrupts import check_interrupt
-from ....schemas.process.os_errors import check_writable
+from ....schemas.runtime.interrupts import check_interrupt
+from ....schemas.runtime.os_errors import check_writable
 from ...avatars.avatar_model import make_avatar
 from ..common.bench_results import Part, write
 from ..common.machine import Clock, cpu_name

@@ -22,7 +22,7 @@ from ....builder.config import BuildConfig
 from ....builder.pipeline import build_archive
 from ....builder.synthetic.figure import figure_points, write_figure
 from ....schemas.errors import SolidcloudError
-from ....schemas.process.own_command import own_command, shown_path
+from ....schemas.runtime.own_command import own_command, shown_path
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.scene_messages import SceneInfo
 from ...cli.input.pose_file import write_poses

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ....schemas.errors import SolidcloudError
-from ....schemas.kernels.kernel_files import default_folder
+from ....schemas.runtime.kernel_files import default_folder
 from ....schemas.wire.warming_parts import READY_LINE
 
 # A server that takes longer without finishing a kernel is considered hung [s]: on a busy machine of

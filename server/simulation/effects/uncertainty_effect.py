@@ -40,7 +40,7 @@ from ....schemas.wire.scene_messages import SceneInfo, SourceInfo
 from ...archives.rigid_transform import transform_poses
 from ...avatars.avatar_model import make_avatar
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
-from ...queries.resident_fast_path import distance_fast
+from ...queries.one_item import distance_fast
 from ..world.frame import Frame, Run
 from .report_effects import is_farther_than
 

@@ -31,8 +31,8 @@ from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import pose_between
 from ...queries.contacts import contacts
+from ...queries.one_item import collide_fast, distance_fast, has_unknown, sweep_fast
 from ...queries.request import EXACT, QueryBudget
-from ...queries.resident_fast_path import collide_fast, distance_fast, has_unknown, sweep_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY

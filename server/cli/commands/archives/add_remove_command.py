@@ -46,7 +46,7 @@ def add(
     The result is a new generation, which a running server serves after solidcloud reload.
     """
     from .....builder.edit.edit_archive import add_scans
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     with (
@@ -83,7 +83,7 @@ def remove(
     reload.
     """
     from .....builder.edit.edit_archive import remove_scans
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     with (

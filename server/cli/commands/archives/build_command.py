@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .....builder.sources.format_table import FORMATS
-from .....schemas.process.own_command import own_command
+from .....schemas.runtime.own_command import own_command
 from ..command_options import AsJson, among, interruptible, parse_bytes, print_json, print_warning
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     from .....builder.passes.archive_summary import summarize_archive
     from .....builder.pipeline import build_archive
     from .....schemas.archive.archive import Archive
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.archive_facts import print_summary
     from ...output.console import print_build
     from ...output.progress_display import progress_listener

@@ -37,7 +37,7 @@ def export(
     stored.
     """
     from .....builder.export.export_archive import export_archive
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.archive_facts import print_export
     from ...output.progress_display import progress_listener
 

@@ -56,7 +56,7 @@ def inspect(
     from .....builder.sources.scan_files import inspect_scans
     from .....builder.sources.scan_list import write_scan_list
     from .....schemas.errors import BadRequestError
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     if output and output.exists() and not overwrite:

@@ -34,7 +34,7 @@ def make_facade(
     _check_new(output, overwrite)
     with needs_extra("made"):
         from .....builder.synthetic.scenes import make_facade as make_it
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
@@ -58,7 +58,7 @@ def make_town(
     _check_new(output, overwrite)
     with needs_extra("made"):
         from .....builder.synthetic.scenes import make_town as make_it
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
@@ -82,7 +82,7 @@ def make_office(
     _check_new(output, overwrite)
     with needs_extra("made"):
         from .....builder.synthetic.office import make_office as make_it
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
@@ -100,7 +100,7 @@ def make_figure(
     """Make an avatar: a human figure in mid-stride."""
     _check_new(output, overwrite)
     from .....builder.synthetic.figure import figure_points, write_figure
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
 
     with interruptible(), naming_write_errors(output):
         write_figure(output, figure_points(points, seed, height))
@@ -121,7 +121,7 @@ def make_walk(
     _check_new(output, overwrite)
     from .....builder.synthetic.truth import read_truth
     from .....builder.synthetic.walk import walk_poses
-    from .....schemas.process.os_errors import naming_write_errors
+    from .....schemas.runtime.os_errors import naming_write_errors
     from ...input.pose_file import write_poses
 
     with interruptible(), naming_write_errors(output):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .....schemas.archive.archive import Archive
 from .....schemas.errors import InternalError
-from .....schemas.kernels.compiling import njit
+from .....schemas.runtime.compiling import njit
 from ....scene import Scene
 from ...common.paired_times import Floats, mean_ratio, time_in_turn
 from .accuracy_results import FieldRow

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from .....schemas.process.new_file import new_file
+from .....schemas.runtime.new_file import new_file
 from ....scene import Scene
 from ...common.paired_times import Floats, mean_ratio
 from .accuracy_results import REPEATS, FrameRow

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .....schemas.process.new_file import new_file
+from .....schemas.runtime.new_file import new_file
 from .....schemas.wire.answers import Verdict
 from .....schemas.wire.motion_messages import FRAME_SECONDS
 from ....scene import Scene

@@ -6,8 +6,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from .....schemas.process.new_file import new_file
-from .....schemas.process.visible_text import visible
+from .....schemas.runtime.new_file import new_file
+from .....schemas.runtime.visible_text import visible
 from ..measurement.accuracy_results import Report
 from .accuracy_charts import length_name
 from .accuracy_texts import answer, choices, findings, size_name

@@ -5,8 +5,8 @@ import html
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .....schemas.process.new_file import new_file
-from .....schemas.process.visible_text import visible
+from .....schemas.runtime.new_file import new_file
+from .....schemas.runtime.visible_text import visible
 from ...common.bench_results import Part, busy, goal_rows, limit_text, number
 
 RELOAD_SECONDS = 10

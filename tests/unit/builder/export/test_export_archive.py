@@ -19,7 +19,7 @@ from solidcloud.schemas.archive.index import Header
 from solidcloud.schemas.archive.voxel_grid import Lattice
 from solidcloud.schemas.archive.vtkhdf import read_points
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.process.new_file import is_temporary
+from solidcloud.schemas.runtime.new_file import is_temporary
 from solidcloud.server.cli.main import run
 from synthetic_scans import make_scan, write_las, write_ply
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.synthetic.scanner import LATTICE, NOISE
 from solidcloud.builder.synthetic.scenes import GeneratedScene, make_facade, make_town
 from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
-from solidcloud.schemas.process.new_file import is_temporary
+from solidcloud.schemas.runtime.new_file import is_temporary
 
 
 def points_of(scene: GeneratedScene) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.process.new_hdf5_file import new_hdf5_file
+from solidcloud.schemas.runtime.new_hdf5_file import new_hdf5_file
 
 
 def write(path: Path, datasets: int = 40) -> None:

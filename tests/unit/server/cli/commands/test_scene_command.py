@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.process.new_file import is_temporary
+from solidcloud.schemas.runtime.new_file import is_temporary
 from solidcloud.schemas.scene.scene_file import parse_scene, read_scene
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files import scene_new

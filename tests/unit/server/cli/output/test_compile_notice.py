@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.kernels.kernel_files import KernelFiles
+from solidcloud.schemas.runtime.kernel_files import KernelFiles
 from solidcloud.server.cli.output import compile_notice
 from solidcloud.server.cli.output.compile_notice import CompileNotice, compile_notices
 

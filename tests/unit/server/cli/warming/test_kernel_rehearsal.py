@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.kernels.compiling import kernel_files
-from solidcloud.schemas.kernels.kernel_files import KernelFiles
+from solidcloud.schemas.runtime.compiling import kernel_files
+from solidcloud.schemas.runtime.kernel_files import KernelFiles
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.warming.kernel_rehearsal import check_answers, rehearse
 from solidcloud.server.scene import Scene

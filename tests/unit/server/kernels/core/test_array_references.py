@@ -5,7 +5,7 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
-from solidcloud.server.queries.resident_fast_path import collide_fast, distance_fast
+from solidcloud.server.queries.one_item import collide_fast, distance_fast
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
-from solidcloud.schemas.process.own_command import own_command
+from solidcloud.schemas.runtime.own_command import own_command
 from solidcloud.server.cli.main import run
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from solidcloud.schemas.kernels import compiling
-from solidcloud.schemas.kernels.compiling import njit
-from solidcloud.schemas.kernels.kernel_files import KernelFiles
+from solidcloud.schemas.runtime import compiling
+from solidcloud.schemas.runtime.compiling import njit
+from solidcloud.schemas.runtime.kernel_files import KernelFiles
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.process.interrupts import (
+from solidcloud.schemas.runtime.interrupts import (
     Interrupted,
     blocking_interrupts,
     blocking_sigint,
@@ -17,7 +17,7 @@ from solidcloud.schemas.process.interrupts import (
     deferring_interrupts,
     interrupt_pending,
 )
-from solidcloud.schemas.process.new_hdf5_file import new_hdf5_file
+from solidcloud.schemas.runtime.new_hdf5_file import new_hdf5_file
 
 
 @pytest.fixture(autouse=True)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import solidcloud
-from solidcloud.schemas.kernels.kernel_sources import source_digest
+from solidcloud.schemas.runtime.kernel_sources import source_digest
 
 CODE = """
 import sys, importlib
 sys.path.insert(0, sys.argv[1])
-from solidcloud.schemas.kernels.kernel_sources import source_digest
+from solidcloud.schemas.runtime.kernel_sources import source_digest
 print(*[source_digest(name).hex() for name in sys.argv[2:]])
 """
 MODULES = [
@@ -57,7 +57,7 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
         "server.kernels.collide.collide_poses",
         "server.kernels.motion.contact_times",
     }
-    assert changed("schemas/kernels/compiling.py") == set(MODULES)
+    assert changed("schemas/runtime/compiling.py") == set(MODULES)
     assert changed("builder/kernels/trees/pack_tree.py") == {"builder.kernels.trees.pack_tree"}
     # A constant of a module that holds no kernel.
     assert changed("schemas/archive/units.py") == {

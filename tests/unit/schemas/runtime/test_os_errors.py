@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.process.os_errors import check_writable, naming_write_errors, os_error_line
+from solidcloud.schemas.runtime.os_errors import check_writable, naming_write_errors, os_error_line
 
 
 def test_the_line_names_the_path_and_no_number():

@@ -8,7 +8,7 @@ file, and numbers its data files so that two processes may take the same number 
 Here a file's name is a digest of everything that determines the machine code: the sources, the
 signature, the family of processors, the versions and numba's settings. No path and nothing else of
 the machine takes part, so that compiled code can be delivered (scripts/build_wheel).
-`schemas/kernels/kernel_files.py` checks a file's content.
+`schemas/runtime/kernel_files.py` checks a file's content.
 """
 
 import functools

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.motion import sweep_resident
-from solidcloud.server.queries import resident_fast_path as module
+from solidcloud.server.queries import one_item as module
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.scene_data import SceneData
 from solidcloud.server.queries.sweep import sweep

@@ -7,7 +7,7 @@ import sys
 import pytest
 from rich.live import Live
 from rich.table import Table
-from solidcloud.schemas.process.visible_text import VisibleStream, show_all_output, visible
+from solidcloud.schemas.runtime.visible_text import VisibleStream, show_all_output, visible
 from solidcloud.server.cli.output.terminal import Terminal
 
 HOSTILE = "\x1b[31m[scan] [/data/hall] :smile: \x00\r\x07\x7f\x9b2J\u202e\u2066\udcff\tend"

@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 import pytest
-from solidcloud.schemas.kernels.compiling import njit, types
-from solidcloud.schemas.kernels.kernel_dispatcher import in_order
 from solidcloud.schemas.kernels.morton import morton_code, morton_encode
+from solidcloud.schemas.runtime.compiling import njit, types
+from solidcloud.schemas.runtime.kernel_dispatcher import in_order
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are plain functions"

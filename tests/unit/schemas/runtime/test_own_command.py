@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.process.own_command import VERBS, own_command, path_advice
+from solidcloud.schemas.runtime.own_command import VERBS, own_command, path_advice
 
 pytestmark = pytest.mark.interpreted
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-import solidcloud.schemas.process.new_file as new_file_module
-from solidcloud.schemas.process.new_file import is_temporary, new_file, new_path, remove_temporaries
+import solidcloud.schemas.runtime.new_file as new_file_module
+from solidcloud.schemas.runtime.new_file import is_temporary, new_file, new_path, remove_temporaries
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

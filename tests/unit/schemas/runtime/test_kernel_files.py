@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.kernels.kernel_files import KernelFiles, default_folder
+from solidcloud.schemas.runtime.kernel_files import KernelFiles, default_folder
 
 NAME = "a.b-0.kernel"
 PAYLOAD = bytes(range(256)) * 8
@@ -142,7 +142,7 @@ def test_a_start_that_was_killed_is_noticed_once(files: KernelFiles, folder: Pat
     code = (
         "import sys, time\n"
         "from pathlib import Path\n"
-        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
+        "from solidcloud.schemas.runtime.kernel_files import KernelFiles\n"
         "with KernelFiles(Path(sys.argv[1])).starting():\n"
         "    print('inside', flush=True)\n"
         "    time.sleep(60)\n"
@@ -171,10 +171,10 @@ def test_the_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> 
 def test_nobody_waits_for_ever(
     files: KernelFiles, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("solidcloud.schemas.kernels.kernel_files._CLAIM_SECONDS", 0.1)
+    monkeypatch.setattr("solidcloud.schemas.runtime.kernel_files._CLAIM_SECONDS", 0.1)
     program = (
         "import sys, time\nfrom pathlib import Path\n"
-        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
+        "from solidcloud.schemas.runtime.kernel_files import KernelFiles\n"
         "files = KernelFiles(Path(sys.argv[1]))\nassert files.read(sys.argv[2]) is None\n"
         "print('compiles', flush=True)\ntime.sleep(60)\n"
     )

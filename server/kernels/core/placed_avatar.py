@@ -180,13 +180,26 @@ def place_nodes(avatar, m, placed, scene):
 
 
 @nb.njit(nogil=True, cache=True)
+def empty_lines(n):
+    """Return n float32 that begin at a cache line.
+
+    numba's arrays begin at a multiple of 32 bytes, and vectors of 64 bytes then may cross a line each.
+    Five processes took 6.8 to 7.5 ms for `distance` on the walk, and 7.0 to 7.2 with this.
+    """
+    raw = np.empty(n + 16, np.float32)
+    first = -raw.ctypes.data % 64 // 4
+    return raw[first : first + n]
+
+
+@nb.njit(nogil=True, cache=True)
 def make_front(avatar):
     """Allocate scratch for one avatar (not empty); nothing is placed yet."""
     which = np.empty(LIST_CAPACITY, np.int32)
     for i in range(avatar.front.shape[1]):
         which[i] = i
     keep = np.zeros(MAX_FRONT, np.bool_)
-    return AvatarFront(np.empty((4, LIST_CAPACITY), np.float32), which, keep, keep.view(np.uint64))
+    bounds = empty_lines(4 * LIST_CAPACITY).reshape((4, LIST_CAPACITY))
+    return AvatarFront(bounds, which, keep, keep.view(np.uint64))
 
 
 @njit_no_refcount
@@ -275,7 +288,7 @@ def make_placed(avatar):
     blocks = avatar.points.shape[0]
     return PlacedAvatar(
         np.empty((4, avatar.center.shape[0]), np.float32),
-        np.empty((blocks, 3, LANES), np.float32),
+        empty_lines(3 * LANES * blocks).reshape((blocks, 3, LANES)),
         np.full(blocks, -1, np.int64),
         np.empty(3, np.int64),
         np.empty(3, np.float64),

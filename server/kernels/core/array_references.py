@@ -5,6 +5,7 @@ which takes longer than most searches (scripts/bench_walk). A reference is one o
 holds them for compiled code: it is taken apart once, when it is made.
 """
 
+import hashlib
 import sys
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,8 +29,15 @@ def reference(fields: _Fields) -> _Fields:
     if nb.config.DISABLE_JIT:
         return fields
     name, module = fields.__name__, fields.__module__
+
+    def name_shortly(self: Any, types: Any) -> None:
+        """Replace numba's name of a type, which lists all fields: it is part of each function's name."""
+        nb.types.StructRef.__init__(self, types)
+        self.name = f"{name}-{hashlib.sha256(self.name.encode()).hexdigest()}"
+
     # Stored kernels name numba's type by module and name.
-    numba_type = type(f"_{name}Type", (nb.types.StructRef,), {"__module__": module})
+    made = {"__module__": module, "__init__": name_shortly}
+    numba_type = type(f"_{name}Type", (nb.types.StructRef,), made)
     setattr(sys.modules[module], numba_type.__name__, nb.structref.register(numba_type))
     found: Any = type(name, (nb.structref.StructRefProxy,), {"__module__": module, "__doc__": fields.__doc__})
     nb.structref.define_proxy(found, numba_type, list(fields._fields))  # type: ignore[attr-defined]

@@ -121,7 +121,7 @@ class FloorScene:
     def warm(self, *parts):
         self.warmed += 1
         if self.never_warm in parts:
-            compiling._progress.begin()
+            compiling._store._begin()
             print(f"warming {self.never_warm}", flush=True)
             threading.Event().wait()
 

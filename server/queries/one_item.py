@@ -1,11 +1,12 @@
 """Fast path of queries of one pose that resident voxels answer: a single kernel call.
 
-The answers equal those of the engines bit for bit, cost counters included, except engine_seconds;
-with a tolerance, that of `distance` is the exact one.
+The answers equal those of the engines bit for bit, cost counters included, except engine_seconds
+and `hits`, the voxels that were examined instead of all in reach; with a tolerance, that of
+`distance` is the exact one.
 The engine is called instead if
 
-- a voxel has to be loaded, or too many are in reach. For `collide` and `distance`, resident voxels suffice
-if nothing in the others changes the answer,
+- a voxel has to be loaded, or too many are in reach. For `collide` and `distance`,
+resident voxels suffice if nothing in the others changes the answer,
 - the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds
 MAX_FAST_REACH,
 - a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).

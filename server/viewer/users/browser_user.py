@@ -73,7 +73,12 @@ class BrowserUser:
         session = scene.client.session(self._name, late="bounds")
         session.__enter__()
         try:
-            self._latest = session.wait(session.wish(pose=pose), _FIRST_SECONDS)
+            end = time.monotonic() + _FIRST_SECONDS
+            state = session.wait(session.wish(pose=pose), _FIRST_SECONDS)
+            # A frame does not wait for voxels: the way to the pose is completed as they are loaded.
+            while state.unloaded and time.monotonic() < end:
+                state = session.wait(session.wish(pose=pose), _FIRST_SECONDS)
+            self._latest = state
         except SolidcloudError:
             session.close()
             raise

@@ -96,7 +96,7 @@ def _settings(file: SceneFile, up: Vec) -> NDArray[np.void]:
 
 
 class _NoBodies:
-    """What `Walker.run` reads of `Bodies`, in a scene without them."""
+    """Stand for `Bodies` in `Walker.run`, in a scene without them."""
 
     lock = nullcontext()
     bounds, kinds, origin = np.empty((0, 2, 3)), np.empty(0, np.uint8), np.zeros(3)

@@ -1,18 +1,24 @@
-"""Section `memory`: resident bytes per point, and the time to load a voxel's record."""
+"""Section `memory`: resident bytes per point, time to load a voxel's record, voxels that the walk loads."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
-from measurement.measured_archives import PAPER_VOXEL, archive_bytes
+from measurement.measured_archives import PAPER_VOXEL, archive_bytes, build
+from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.server.report.common.bench_results import Part
 from solidcloud.server.report.common.machine import Clock
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
+from solidcloud.server.scene import Scene
 
 from .bench_context import Bench, our_name
 
 BYTES_A_POINT, DECODE_MS = 10.0, 5.0
 MAX_LOADS = 40
+SMALL_VOXEL = 2  # [m]; smaller than what a query reaches, so that the broad phase decides what is loaded
+MOST_LOADED = {"collide": 51, "distance": 125, "raycast": 267}
+DISTANCE_REACH, RAY_REACH = 2.0, 50.0  # [m]
 
 
 def run(bench: Bench, clock: Clock) -> Part:
@@ -31,7 +37,32 @@ def run(bench: Bench, clock: Clock) -> Part:
             store.close()
         if voxel == PAPER_VOXEL:
             part.goal("decode", f"the paper's voxel, its record to resident ({name})", loads, DECODE_MS, "ms")
+    _walk_loads(bench, part)
     return part
+
+
+def _walk_loads(bench: Bench, part: Part) -> None:
+    """Count the voxels that each query loads along the walk, beginning with nothing in memory."""
+    scan = bench.folder / "small_voxels.laz"
+    make_facade(scan)
+    archive = build(scan, bench.folder / "small_voxels", voxel=SMALL_VOXEL, step=None)
+    name, walk = our_name(SMALL_VOXEL), bench.walk
+    eyes, directions = walk[:, :3, 3] + [0.0, 0.0, 1.5], np.random.default_rng(7).normal(size=(len(walk), 3))
+    asked: dict[str, Callable[[Scene], object]] = {
+        "collide": lambda scene: scene.collide("avatar", walk),
+        "distance": lambda scene: scene.distance("avatar", walk, DISTANCE_REACH),
+        "raycast": lambda scene: scene.raycast(eyes, directions, RAY_REACH),
+    }
+    for query, ask in asked.items():
+        with Scene.open(archive, budget_bytes=1 << 30) as scene:
+            scene.add_avatar("avatar", bench.avatar)
+            ask(scene)
+            found = scene.stats()
+        part.add("walk", name, f"{query}, resident bytes", found.resident_bytes, "bytes", len(walk))
+        loads = part.add("walk", name, f"{query}, voxels loaded", found.misses, "voxels", len(walk))
+        part.goal(
+            f"{query} loads", f"voxels that {query} loads along the walk", loads, MOST_LOADED[query], "voxels"
+        )
 
 
 def _loads(bench: Bench, clock: Clock, part: Part, store: VoxelStore, name: str) -> float:

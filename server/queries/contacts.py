@@ -38,10 +38,9 @@ from ..kernels.contacts.contact_cells import (
     make_cells,
 )
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
-from ..kernels.core.node_overlap import STACK
-from ..kernels.core.reach import VoxelLists
+from ..kernels.core.node_bounds import STACK
+from ..kernels.core.reach import VoxelLists, VoxelsInReach
 from ..kernels.core.scene_arrays import LANES
-from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import drop_clear_of
 from .distance import signed_from_square

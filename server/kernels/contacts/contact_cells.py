@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import U32, ClassThresholds
-from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units, place, to_units
+from ..core.node_bounds import U32, ClassThresholds
+from ..core.placed_avatar import MAX_REACH_UNITS, compare_separations, lattice_to_units, place, to_units
 from ..core.scene_arrays import ROWS_AT_ONCE, copy_rows, stopped
-from ..core.separation_order import compare_separations
 
 # Columns of a record. The first ORDER of them determine which pair is deeper: |a - b|^2 [exact
 # units^2], and the largest radius minus that of the scan point [exact units]. Pairs of equal

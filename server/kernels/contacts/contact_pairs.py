@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import (
+from ..core.node_bounds import (
     ONE_SLACK,
     lanes_meet,
     make_class_thresholds,

@@ -5,7 +5,7 @@ takes three runs. It takes a fourth run where the archive keeps scan numbers (`-
 
 - rows: (n, 12) words, one row a node: center x, y, z, radius [voxel steps], the slab's normal x, y,
   z, its length, least and greatest dot(normal, point - center), or a box in their place
-  (node_boxes.py); then two int32: the first child row, or ~block for a leaf node; a word whose low
+  (node_bounds.py); then two int32: the first child row, or ~block for a leaf node; a word whose low
   byte is the number of children or points and whose next byte is the node's radius class. 48 bytes,
   four rows to three cache lines;
 - blocks: (b, 4) int32, one block a leaf node: low corner x, y, z of the box of its points [voxel

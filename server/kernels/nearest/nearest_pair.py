@@ -10,7 +10,7 @@ points are placed: their coordinates are relative to the frame or to the block's
 points are whole steps from the low corner of their block.
 
 Float32 separates nearly all pairs of points from the best one. The pairs it cannot separate are
-squared in integers (NUMERICS.md N5) and compared by separation_order.py. The least separation, and
+squared in integers (NUMERICS.md N5) and compared by `compare_separations`. The least separation, and
 the pair that has it, are therefore those of the definition, for every tree and order.
 """
 
@@ -22,11 +22,9 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_boxes import box_square, has_box
-from ..core.node_overlap import ONE_SLACK, SLACK, STACK, U32, make_thresholds
-from ..core.placed_avatar import lattice_to_units, place, to_units
+from ..core.node_bounds import ONE_SLACK, SLACK, STACK, U32, box_square, has_box, make_thresholds
+from ..core.placed_avatar import compare_separations, lattice_to_units, place, to_units
 from ..core.scene_arrays import LANES, point_class
-from ..core.separation_order import compare_separations
 
 U = np.uint64  # see placed_avatar.py
 # Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is

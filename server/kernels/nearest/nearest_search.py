@@ -21,7 +21,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_overlap import (
+from ..core.node_bounds import (
     BROAD,
     FLAT,
     U32,
@@ -42,7 +42,7 @@ from ..core.placed_avatar import (
     place_lanes,
     place_root,
 )
-from ..core.reach import HELD, NOT_HELD, resident_front, state_of
+from ..core.reach import HELD, NOT_HELD, VALID, find_reach, resident_front, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -53,7 +53,6 @@ from ..core.scene_arrays import (
     node_class,
     stopped,
 )
-from ..core.voxels_in_reach import VALID, find_reach
 from .nearest_pair import (
     NearestPairs,
     found_units,

@@ -38,8 +38,7 @@ from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_boxes import enter_box, has_box
-from ..core.node_overlap import U32
+from ..core.node_bounds import U32, enter_box, has_box
 from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
 from ..core.reach import MISSING, NOT_HELD, REACH_STACK, all_resident, list_item, state_of
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped

@@ -10,7 +10,7 @@ import numpy as np
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_boxes import box_square, has_box
+from ..core.node_bounds import box_square, has_box
 from ..core.normal_codes import add_sums
 from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS

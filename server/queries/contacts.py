@@ -150,7 +150,7 @@ def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) 
 def empty_memory(limit: int) -> ContactState:
     """Return the memory of a search that has not begun."""
     return ContactState(
-        make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),
+        make_cells(FIRST_CELLS), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),
         np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip

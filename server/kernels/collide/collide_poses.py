@@ -49,11 +49,14 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_bounds import (
     BROAD,
     FLAT,
+    ONE_SLACK,
     STACK,
     U32,
+    ClassThresholds,
     compact_marked,
     copy_node,
     lanes_meet,
+    locate_block,
     locate_voxel,
     make_class_thresholds,
     mark_meeting,
@@ -61,9 +64,10 @@ from ..core.node_bounds import (
     nodes_meet,
     power_distance,
     set_class_thresholds,
-    sphere_is_near,
 )
 from ..core.placed_avatar import (
+    AvatarFront,
+    PlacedAvatar,
     make_front,
     make_placed,
     node_reach,
@@ -97,6 +101,7 @@ EARLY = 3
 class _CollideScratch(NamedTuple):
     """Scratch of one call.
 
+    placed, front: the avatar under the pose in hand.  by_class: the pose's thresholds.
     stack: (STACK, 3) int64: scene row, start of its list, length.
     below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
     keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
@@ -104,6 +109,9 @@ class _CollideScratch(NamedTuple):
     early: (2,) float32, see `set_early`.
     """
 
+    placed: PlacedAvatar
+    front: AvatarFront
+    by_class: ClassThresholds
     stack: NDArray[np.int64]
     below: NDArray[np.int64]
     keep: NDArray[np.bool_]
@@ -113,30 +121,25 @@ class _CollideScratch(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def _make_collide_scratch(avatar):
-    """Allocate scratch for one avatar (not empty)."""
+def _make_collide_scratch(avatar, deficit):
+    """Allocate scratch for one avatar (not empty), and the radius classes of `deficit`."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
-    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(2, np.int64)
     return _CollideScratch(
-        stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters, np.empty(2, np.float32)
-    )
+        make_placed(avatar), make_front(avatar), make_class_thresholds(deficit), np.empty((STACK, 3), np.int64),
+        np.empty(below, np.int64), keep, keep.view(np.uint64), np.zeros(2, np.int64), np.empty(2, np.float32),
+    )  # fmt: skip
 
 
 @njit_no_refcount
-def _leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
+def _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch):
     """Return CONTACT if a marked point of a block touches a point of leaf node `row`.
 
     Return EARLY if a pair within the tolerance is met first, and CLEAR if there is neither.
     """
+    placed, by_class, early = scratch.placed, scratch.by_class, scratch.early[1]
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
-    number = ~np.int64(ints[U(row + FIRST)])
-    block_at = location.blocks + number * scene.block_words
-    lane_at = location.lanes + number * 3 * LANES
-    low_x = location.x + np.float32(ints[U(block_at)])
-    low_y = location.y + np.float32(ints[U(block_at + 1)])
-    low_z = location.z + np.float32(ints[U(block_at + 2)])
-    early = scratch.early[1]
+    block_at, lane_at, low_x, low_y, low_z = locate_block(ints, location, row, scene.block_words)
     far = max(by_class.far[leaf_class(ints, row, mask)], early)  # for the largest sphere in the block
     begin = 0
     while begin < LANES:
@@ -169,13 +172,13 @@ def _leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_clas
 
 
 @njit_no_refcount
-def _below_touches(avatar, m, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
+def _below_touches(avatar, m, extent, pose, scene, voxel, location, a, row, scratch):
     """Return what `_leaves_touch` finds for a scene leaf node and a node of the avatar's front.
 
     The avatar's node is descended depth first. This is for avatars whose front is not their leaf
     nodes.
     """
-    words, below = scene.words, scratch.below
+    words, below, placed, by_class = scene.words, scratch.below, scratch.placed, scratch.by_class
     threshold = by_class.threshold[node_class(scene.ints, row, by_class.mask)]
     per_step = 1.0 / scene.step
     below[0] = a
@@ -188,16 +191,14 @@ def _below_touches(avatar, m, extent, pose, placed, scene, voxel, location, a, r
         if a_first < 0:
             block = np.int64(~a_first)
             if avatar.inner_points > 0 and not _may_touch(
-                avatar, m, per_step, extent, placed, scene, location, a, row, threshold, scratch
+                avatar, m, extent, scene, location, a, row, threshold, scratch
             ):
                 continue
             place_block_once(avatar, m, pose, block, placed, scene)
             if lanes_meet(
                 words, row, placed.lanes, block, location.x, location.y, location.z, threshold, scratch.keep
             ):
-                found = _leaves_touch(
-                    avatar, m, block, placed, scene, voxel, location, row, by_class, scratch
-                )
+                found = _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch)
                 if found != CLEAR:
                     return found
             continue
@@ -211,7 +212,7 @@ def _below_touches(avatar, m, extent, pose, placed, scene, voxel, location, a, r
 
 
 @njit_no_refcount
-def _may_touch(avatar, m, per_step, extent, placed, scene, location, a, row, threshold, scratch):
+def _may_touch(avatar, m, extent, scene, location, a, row, threshold, scratch):
     """Return whether a point of a scene leaf node is near a leaf node of the avatar.
 
     A scene leaf node of scattered points may hold much of the inside of a filled mesh without a
@@ -219,23 +220,19 @@ def _may_touch(avatar, m, per_step, extent, placed, scene, location, a, row, thr
     the points in that node: 1.4 instead of 3.9 us a pose for a ball near the façade (bench_engine,
     `filled`).
     """
-    ints = scene.ints
-    number = ~np.int64(ints[U(row + FIRST)])
-    block_at = location.blocks + number * scene.block_words
-    lane_at = location.lanes + number * 3 * LANES
+    _, lane_at, low_x, low_y, low_z = locate_block(scene.ints, location, row, scene.block_words)
     scratch.counters[1] += LANES
-    x, y, z = place_node(avatar, m, a, placed, scene)
-    return sphere_is_near(
-        scene.halves,
-        lane_at,
-        location.x + np.float32(ints[U(block_at)]),
-        location.y + np.float32(ints[U(block_at + 1)]),
-        location.z + np.float32(ints[U(block_at + 2)]),
-        x,
-        y,
-        z,
-        node_reach(avatar.radius[a], per_step, extent) + threshold,
-    )
+    x, y, z = place_node(avatar, m, a, scratch.placed, scene)
+    x, y, z = x - low_x, y - low_y, z - low_z
+    reach = node_reach(avatar.radius[a], 1.0 / scene.step, extent) + threshold
+    halves, near, square = scene.halves, False, reach * reach * ONE_SLACK
+    for j in range(LANES):
+        i = U(lane_at) + U(j)
+        dx = np.float32(halves[i]) - x
+        dy = np.float32(halves[i + U(LANES)]) - y
+        dz = np.float32(halves[i + U(2 * LANES)]) - z
+        near |= dx * dx + dy * dy + dz * dz <= square
+    return near
 
 
 @njit_no_refcount
@@ -289,18 +286,13 @@ def _surely_near(words, ints, halves, block_words, location, row, x, y, z, lanes
     leaf = _leaf_towards(words, ints, location.rows, row, x - off_x, y - off_y, z - off_z)
     if not lanes_meet(words, leaf, lanes, block, off_x, off_y, off_z, early[0], keep):
         return False, 0
-    number = ~np.int64(ints[U(leaf + FIRST)])
-    block_at = location.blocks + number * block_words
-    lane_at = location.lanes + number * 3 * LANES
-    low_x = off_x + np.float32(ints[U(block_at)])
-    low_y = off_y + np.float32(ints[U(block_at + 1)])
-    low_z = off_z + np.float32(ints[U(block_at + 2)])
+    _, lane_at, low_x, low_y, low_z = locate_block(ints, location, leaf, block_words)
     lane, tested = next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, early[1], keep, keep8, 0)
     return lane >= 0, LANES * tested
 
 
 @njit_no_refcount
-def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch):
+def _collide_voxel(avatar, m, extent, pose, scene, voxel, location, count, scratch):
     """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets.
 
     The scene's tree is descended depth first, each node with a list of
@@ -309,6 +301,7 @@ def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_c
     costs the same again (11 us a pose instead of 4 with each step in a function).
     """
     words, ints, stack, counters = scene.words, scene.ints, scratch.stack, scratch.counters
+    placed, front, by_class = scratch.placed, scratch.front, scratch.by_class
     bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
     listed, listed8, keep = front.keep, front.keep8, scratch.keep
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
@@ -366,9 +359,7 @@ def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_c
                         if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
                             continue
                         if first < 0:
-                            found = _leaves_touch(
-                                avatar, m, block, placed, scene, voxel, location, row, by_class, scratch
-                            )
+                            found = _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch)
                             if found != CLEAR:
                                 return found
                             if stopped(stop):  # the blocks of a whole front may take milliseconds
@@ -376,8 +367,8 @@ def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_c
                             continue
                     elif first < 0:
                         found = _below_touches(
-                            avatar, m, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
-                        )  # fmt: skip
+                            avatar, m, extent, pose, scene, voxel, location, a, row, scratch
+                        )
                         if found != CLEAR:
                             return found
                         continue
@@ -421,18 +412,14 @@ def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, 
     and a missing voxel overrides CLEAR. Once the scene's stop flag is set, poses are not
     finished.
     """
-    placed, front, scratch = make_placed(avatar), make_front(avatar), _make_collide_scratch(avatar)
-    by_class = make_class_thresholds(scene.radius_deficit)
-    _collide_poses(
-        poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, placed, front, by_class, scratch
-    )  # fmt: skip
+    scratch = _make_collide_scratch(avatar, scene.radius_deficit)
+    _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, scratch)
 
 
 @njit_no_refcount
-def _collide_poses(
-    poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, placed, front, by_class, scratch
-):  # fmt: skip
+def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, scratch):
     """Implement `collide_poses` with its scratch passed in."""
+    placed, by_class = scratch.placed, scratch.by_class
     nodes, ints, rows = placed.nodes, scene.ints, reach.lists.rows
     scratch.early[:] = np.float32(-1.0)
     largest_deficit = np.int64(0)
@@ -448,15 +435,7 @@ def _collide_poses(
         m = poses[i]
         scratch.counters[0], scratch.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, placed, scene)
-        error = set_class_thresholds(
-            by_class,
-            scene.radius_deficit,
-            reach.units[i],
-            scene.units_per_step,
-            extent,
-            farthest,
-            scene.voxel_steps,
-        )
+        error = set_class_thresholds(by_class, scene, reach.units[i], extent, farthest)
         if tolerance > 0:
             set_early(scratch.early, tolerance, reach.units[i] - largest_deficit, scene.units_per_step, error)
         count = 0  # length of the front; not placed yet, as most far poses never need it
@@ -476,10 +455,8 @@ def _collide_poses(
             threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
             if nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 if count == 0:
-                    count = place_front(avatar, m, placed, scene, extent, front.bounds)
-                found = _collide_voxel(
-                    avatar, m, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
-                )
+                    count = place_front(avatar, m, placed, scene, extent, scratch.front.bounds)
+                found = _collide_voxel(avatar, m, extent, i, scene, voxel, location, count, scratch)
                 if found != CLEAR:
                     verdict[i], at = found, end
                     break

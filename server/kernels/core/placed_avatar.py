@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.runtime import compiling as nb
-from .kernel_decorators import njit_no_refcount
+from .kernel_decorators import njit_inlined, njit_no_refcount
 from .scene_arrays import LANES
 
 U = np.uint64
@@ -145,6 +145,12 @@ def lattice_to_units(steps, units_per_step):
 
 
 @njit_no_refcount
+def _from_frame(world, frame, step):
+    """Return a placed coordinate [m] relative to that of the frame [steps], float32."""
+    return np.float32((world - np.float64(frame) * step) * (1.0 / step))
+
+
+@njit_no_refcount
 def place_root(avatar, m, placed, scene):
     """Choose the frame and place an avatar's root; fill placed.frame, shift and node 0.
 
@@ -157,7 +163,7 @@ def place_root(avatar, m, placed, scene):
         placed.shift[r] = m[r, 3] - scene.origin[r]
         root = place(m, placed.shift, r, x, y, z)
         placed.frame[r] = np.int64(np.rint(root * per_step))
-        placed.nodes[r, 0] = np.float32((root - np.float64(placed.frame[r]) * scene.step) * per_step)
+        placed.nodes[r, 0] = _from_frame(root, placed.frame[r], scene.step)
     placed.nodes[3, 0] = node_reach(avatar.radius[0], per_step, extent)
     return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
 
@@ -269,7 +275,7 @@ def place_lanes(points, m, block, lanes, shift, frame, step):
             lanes[b, r, j] = np.float32((world - base) * per_step)
 
 
-@njit_no_refcount
+@njit_inlined
 def place_block_once(avatar, m, pose, block, placed, scene):
     """Place a block of the avatar unless it is already placed for this pose."""
     if placed.stamp[U(block)] != pose:
@@ -280,18 +286,12 @@ def place_block_once(avatar, m, pose, block, placed, scene):
 @njit_no_refcount
 def place_node(avatar, m, a, placed, scene):
     """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
-    per_step = 1.0 / scene.step
+    shift, frame, step = placed.shift, placed.frame, scene.step
     x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
     return (
-        np.float32(
-            (place(m, placed.shift, 0, x, y, z) - np.float64(placed.frame[0]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 1, x, y, z) - np.float64(placed.frame[1]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 2, x, y, z) - np.float64(placed.frame[2]) * scene.step) * per_step
-        ),
+        _from_frame(place(m, shift, 0, x, y, z), frame[0], step),
+        _from_frame(place(m, shift, 1, x, y, z), frame[1], step),
+        _from_frame(place(m, shift, 2, x, y, z), frame[2], step),
     )
 
 
@@ -309,27 +309,56 @@ def make_placed(avatar):
 
 
 @njit_no_refcount
-def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
+def place_units(points, m, shift, block, lane):
+    """Place the centre of an avatar's point: three int64, exact units."""
+    x, y, z = points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
+    return (
+        to_units(place(m, shift, 0, x, y, z)),
+        to_units(place(m, shift, 1, x, y, z)),
+        to_units(place(m, shift, 2, x, y, z)),
+    )
+
+
+@njit_no_refcount
+def lattice_point(corner, ints, halves, block_at, lane_at, j):
+    """Return the lattice coordinates of a scan point, three int64.
+
+    corner: (3,) int64, of its voxel.  block_at, lane_at, j: see scene_arrays.py.
+    """
+    return (
+        corner[0] + np.int64(ints[block_at]) + np.int64(halves[lane_at + j]),
+        corner[1] + np.int64(ints[block_at + 1]) + np.int64(halves[lane_at + LANES + j]),
+        corner[2] + np.int64(ints[block_at + 2]) + np.int64(halves[lane_at + 2 * LANES + j]),
+    )
+
+
+@njit_no_refcount
+def square_apart(center, point, units_per_step):
     """Compute |a - b|^2 of one pair by the definition (NUMERICS.md N5), int64, exact units.
 
-    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
-    scene_arrays.py.
-    Returns -1 where the points are farther apart along an axis than any reach, MAX_REACH_UNITS;
-    squares therefore fit 63 bits.
+    center: of `place_units`.  point: of `lattice_point`.
+    Returns -1 where they are farther apart along an axis than any reach, MAX_REACH_UNITS; squares
+    therefore fit 63 bits.
     """
     square = np.int64(0)
-    points = avatar.points
     for r in range(3):
-        world = place(
-            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-        )
-        low = scene.corners[voxel, r] + np.int64(scene.ints[block_at + r])
-        steps = low + np.int64(scene.halves[lane_at + r * LANES + j])
-        difference = to_units(world) - lattice_to_units(steps, scene.units_per_step)
+        difference = center[r] - lattice_to_units(point[r], units_per_step)
         if abs(difference) > MAX_REACH_UNITS:
             return np.int64(-1)
         square += difference * difference
     return square
+
+
+@njit_no_refcount
+def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
+    """Compute |a - b|^2 of one pair, see `square_apart`.
+
+    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
+    scene_arrays.py.
+    """
+    center = place_units(avatar.points, m, placed.shift, block, lane)
+    point = lattice_point(scene.corners[voxel], scene.ints, scene.halves, block_at, lane_at, j)
+    return square_apart(center, point, scene.units_per_step)
 
 
 @njit_no_refcount
@@ -381,6 +410,8 @@ def compare_separations(square, radius, other_square, other_radius):
     as the radius.
     """
     radius_difference = radius - other_radius
+    if radius_difference == 0:
+        return 0 if square == other_square else -1 if square < other_square else 1
     apart = (math.sqrt(np.float64(square)) - math.sqrt(np.float64(other_square))) - np.float64(
         radius_difference
     )
@@ -388,6 +419,6 @@ def compare_separations(square, radius, other_square, other_radius):
         return -1
     if apart > CERTAIN:
         return 1
-    if radius_difference >= 0:
+    if radius_difference > 0:
         return _compare_roots(square, other_square, radius_difference)
     return -_compare_roots(other_square, square, -radius_difference)

@@ -8,7 +8,7 @@ reach; a ray and a part of a motion are moving cubes. All tests are wider than t
 An entry of a list carries `near`, a lower bound of how far away the voxel's points are. It serves
 order and pruning, and bounds what is not in memory. It never decides an answer.
 
-`find_reach` also checks the poses of a request.
+Poses are checked here too, before their reach is computed.
 """
 
 import math
@@ -23,7 +23,7 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
 from .placed_avatar import MAX_REACH_UNITS, largest_term, place
-from .scene_arrays import ROWS_AT_ONCE, stopped
+from .scene_arrays import stopped
 
 # What a search may do with a voxel: stop before it, examine it, or count it as missing. An array of
 # states (v,) uint8; an empty one says that all voxels are held.
@@ -33,11 +33,10 @@ FAN = 8
 # On each level, FAN - 1 siblings stay on the stack; 2^63 rows have 21 levels.
 REACH_STACK = 22 * FAN
 INFINITE = np.inf
-# Poses checked between two checks of the stop flag.
-POSES_AT_ONCE = 64
+# Poses checked, and entries sorted, between two checks of the stop flag: tens of microseconds.
+POSES_AT_ONCE, ENTRIES_AT_ONCE = 64, 512
 # Voxels in reach of a query of one item that is answered in one call.
 MAX_ROWS_OF_ONE = 64
-
 # Coordinates near a pose must be exact in float32, with a bit to spare (collide_poses.py).
 MAX_FRAME_STEPS = 1 << 23
 VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, SCALED, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
@@ -145,9 +144,7 @@ def find_lists(tree: VoxelTree, items: Items, stop: NDArray[np.int64]) -> VoxelL
     k = len(items.span)
     capacity = max(64, 8 * k)
     while True:
-        lists = VoxelLists(
-            np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.empty(k)
-        )
+        lists = make_reach(k, capacity).lists
         needed = list_reach(tree, items, stop, lists)
         if needed <= capacity:
             return lists
@@ -235,7 +232,7 @@ def _sort(rows, near, begin, end, stop):
         gap = 3 * gap + 1
     while gap > 0:
         for i in range(begin + gap, end):
-            if i % ROWS_AT_ONCE == 0 and stopped(stop):
+            if i % ENTRIES_AT_ONCE == 0 and stopped(stop):
                 return
             row, key = rows[i], near[i]
             j = i
@@ -393,29 +390,19 @@ def check_poses(poses, node_radius, radius, other_units, scene, units):
 
 @nb.njit(nogil=True, cache=True)
 def find_reach(poses, avatar, radius, other_units, scene, tree, reach):
-    """Check poses and list the voxels in reach of each: `check_poses`, then `voxels_in_reach`.
+    """Check poses, and list the voxels whose points the avatar's root sphere could touch under each.
 
-    radius: of the avatar's points [m].  other_units: radius of the scan's points plus the margin,
-    exact units. Fills `reach`.
-    Returns (fault, pose, value found), as `check_poses` does, and the number of rows needed.
+    poses: (k, 4, 4).  radius: of the avatar's points [m].  other_units: radius of the scan's points plus
+    the margin, exact units.  scene: SceneArrays.
+    Fills `reach`. Returns (fault, pose, value found), as `check_poses` does, and how many rows are
+    needed; those beyond the capacity are not written. -1 rows: the scene's stop flag is set, and the
+    lists are not filled.
+    The reach is widened by more than the rounding of this function: a millionth of itself, one
+    step, and 2^-49 of the largest term of the sums.
     """
     fault, pose, found = check_poses(poses, avatar.radius, radius, other_units, scene, reach.units)
     if fault != VALID or avatar.radius.shape[0] == 0:
         return fault, pose, found, 0
-    return fault, pose, found, voxels_in_reach(poses, avatar, scene, tree, reach)
-
-
-@nb.njit(nogil=True, cache=True)
-def voxels_in_reach(poses, avatar, scene, tree, reach):
-    """List, for each pose, the voxels whose points the avatar's root sphere could touch, nearest first.
-
-    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays.
-    Fills lists and outside of `reach` from its units. Returns how many rows are needed; those
-    beyond the capacity are not written. Returns -1 when the scene's stop flag is set; `reach` is then
-    not filled.
-    The reach is widened by more than the rounding of this function: a millionth of itself, one
-    step, and 2^-49 of the largest term of the sums.
-    """
     outside, lists, stack = reach.outside, reach.lists, np.empty(REACH_STACK, np.int64)
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
     shift, center = np.empty(3), np.empty(3)
@@ -436,6 +423,6 @@ def voxels_in_reach(poses, avatar, scene, tree, reach):
         needed = list_item(tree, center, center, span, own, scene.stop, stack, lists.rows, lists.near, needed)
         lists.unseen[i] = unknown_near(tree, center, center, span, own)
         if stopped(scene.stop):
-            return -1
+            return fault, pose, found, -1
     lists.starts[poses.shape[0]] = needed
-    return needed
+    return fault, pose, found, needed

@@ -22,8 +22,17 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_bounds import ONE_SLACK, SLACK, STACK, U32, box_square, has_box, make_thresholds
-from ..core.placed_avatar import compare_separations, lattice_to_units, place, to_units
+from ..core.node_bounds import (
+    ONE_SLACK,
+    SLACK,
+    STACK,
+    U32,
+    box_square,
+    has_box,
+    make_thresholds,
+    write_squares,
+)
+from ..core.placed_avatar import compare_separations, lattice_point, place_units, square_apart
 from ..core.scene_arrays import LANES, point_class
 
 U = np.uint64  # see placed_avatar.py
@@ -133,23 +142,6 @@ def lower_bound(words, row, x, y, z, radius):
     return max(apart - both, gap / words[at + U(7)] - radius) - slack
 
 
-@njit_no_refcount
-def write_squares(halves, lane_at, x, y, z, squares):
-    """Write the squared distances (LANES,) of a scene block's points to a point.
-
-    x, y, z, and the block's points: relative to the block's low corner.
-    """
-    # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
-    # lanes).
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        squares[j] = dx * dx + dy * dy + dz * dz
-
-
 @njit_inlined
 def unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
     """Unmark the points of an avatar's block that are beyond `far` from a scene block's box.
@@ -192,9 +184,7 @@ def nearest_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, ke
                 continue
             tested += 1
             x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
-            # The bits of non-negative floats sort like the numbers. The minimum of integers is
-            # vectorised; that of floats is not, because LLVM must allow for a NaN.
-            least = np.int32(0x7F800000)
+            least = np.int32(0x7F800000)  # infinity, see `write_squares`
             for j in range(LANES):
                 i = h + U(j)
                 dx = np.float32(halves[i]) - x
@@ -280,45 +270,21 @@ def _update_best(
     Ties go to the lesser scan point, then to the lesser avatar centre.
     points, shift: of Avatar and PlacedAvatar.  corner: (3,) int64, of the voxel [steps].  deficit:
     of the scan point's class.
-    The square is that of `pair_square`.
     """
-    square = np.int64(0)
     units -= deficit
-    for r in range(3):
-        world = place(m, shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
-        steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        difference = to_units(world) - lattice_to_units(steps, units_per_step)
-        if abs(difference) > units:
-            return
-        square += difference * difference
-    if square > units * units:
+    center = place_units(points, m, shift, block, lane)
+    point = lattice_point(corner, ints, halves, block_at, lane_at, j)
+    square = square_apart(center, point, units_per_step)
+    if square < 0 or square > units * units:
         return
-    lesser = found[0] < 0
-    if not lesser:
-        if deficit == found[7]:
-            if square > found[0]:
-                return
-            lesser = square < found[0]
-        else:
-            order = compare_separations(square, -deficit, found[0], -found[7])
-            if order > 0:
-                return
-            lesser = order < 0
-    for r in range(6):
-        if r < 3:
-            value = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        else:
-            world = place(
-                m, shift, r - 3, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-            )
-            value = to_units(world)
-        if not lesser:
-            if value > found[1 + r]:
-                return
-            lesser = value < found[1 + r]
-        # While all earlier values are equal, this writes the value already stored.
-        found[1 + r] = value
+    if found[0] >= 0:
+        order = compare_separations(square, -deficit, found[0], -found[7])
+        known = (found[1], found[2], found[3], found[4], found[5], found[6])
+        if order > 0 or (order == 0 and point + center >= known):
+            return
     found[0], found[7] = square, deficit
+    for r in range(3):
+        found[1 + r], found[4 + r] = point[r], center[r]
 
 
 @njit_no_refcount

@@ -14,8 +14,10 @@ visiting them in stored order (scripts/bench_engine, distance on the walk).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
@@ -28,18 +30,22 @@ from ..core.node_bounds import (
     compact_marked,
     copy_node,
     lanes_meet,
+    locate_block,
+    locate_voxel,
     mark_meeting,
     nodes_meet,
 )
 from ..core.placed_avatar import (
+    AvatarFront,
+    PlacedAvatar,
     lattice_to_units,
     make_front,
     make_placed,
-    node_reach,
     pad_list,
-    place,
+    place_block_once,
     place_front,
     place_lanes,
+    place_nodes,
     place_root,
 )
 from ..core.reach import HELD, NOT_HELD, VALID, find_reach, resident_front, state_of
@@ -54,6 +60,7 @@ from ..core.scene_arrays import (
     stopped,
 )
 from .nearest_pair import (
+    BestPair,
     NearestPairs,
     found_units,
     lower_bound,
@@ -73,40 +80,28 @@ U = np.uint64  # see placed_avatar.py
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
 
 
-@njit_no_refcount
-def place_all(avatar, m, placed, scene, bounds):
-    """Place an avatar: root and nodes below its front into placed.nodes, the front in `bounds`.
+class _SearchScratch(NamedTuple):
+    """Scratch of one call.
 
-    The front becomes the first list of `bounds`. Fills placed.frame and shift. Returns (extent,
-    farthest) for `make_thresholds` and the length of the list.
+    placed, front: the avatar under the pose in hand.  best: the pair found.
+    gaps: for each voxel of the pose's list, its `near`; inf: missing.  classes: of their largest
+    spheres.
     """
-    extent, farthest = place_root(avatar, m, placed, scene)
-    count = place_front(avatar, m, placed, scene, extent, bounds)
-    if avatar.first[avatar.front_first] < 0:
-        return extent, farthest, count  # only points are below
-    center, radius, nodes, shift = avatar.center, avatar.radius, placed.nodes, placed.shift
-    per_step = 1.0 / scene.step
-    for a in range(avatar.front_first, center.shape[0]):
-        for r in range(3):
-            world = place(m, shift, r, center[a, 0], center[a, 1], center[a, 2])
-            nodes[r, a] = np.float32((world - np.float64(placed.frame[r]) * scene.step) * per_step)
-        nodes[3, a] = node_reach(radius[a], per_step, extent)
-    return extent, farthest, count
+
+    placed: PlacedAvatar
+    front: AvatarFront
+    best: BestPair
+    gaps: NDArray[np.float64]
+    classes: NDArray[np.uint64]
 
 
 @njit_inlined
 def _search_leaves(m, a, row, avatar, placed, scene, location, best):
     """Update the best pair from an avatar's leaf node (its marked points) and a scene's."""
     ints, lanes, keep, block = scene.ints, placed.lanes, best.keep, ~np.int64(avatar.first[U(a)])
-    off = best.off
     for lane in range(avatar.count[U(a)], LANES):
         keep[U(lane)] = False  # repeats the last point
-    number = ~np.int64(ints[U(row + FIRST)])
-    block_at = location[1] + number * scene.block_words
-    lane_at = location[2] + number * 3 * LANES
-    low_x = off[0] + np.float32(ints[U(block_at)])
-    low_y = off[1] + np.float32(ints[U(block_at + 1)])
-    low_z = off[2] + np.float32(ints[U(block_at + 2)])
+    block_at, lane_at, low_x, low_y, low_z = locate_block(ints, location, row, scene.block_words)
     halves, c = scene.halves, leaf_class(ints, row, best.mask)
     unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
     least, tested = nearest_squares(
@@ -149,9 +144,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best):
         a_first = np.int64(firsts[a])
         if a_first < 0:
             block = ~a_first
-            if placed.stamp[block] != pose:
-                place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
-                placed.stamp[block] = pose
+            place_block_once(avatar, m, pose, block, placed, scene)
             if lanes_meet(words, row, placed.lanes, block, off[0], off[1], off[2], within, best.keep):
                 _search_leaves(m, a, row, avatar, placed, scene, location, best)
             continue
@@ -168,29 +161,29 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best):
 
 
 @njit_no_refcount
-def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, best):
+def _nearest_voxel(avatar, m, pose, scene, voxel, count, scratch):
     """Search one resident voxel for a nearer pair; return `_least_left`.
 
     The descent is that of collide_poses.py, and the function is long for the same reason.
     """
-    words, ints = scene.words, scene.ints
+    words, ints, placed, front, best = scene.words, scene.ints, scratch.placed, scratch.front, scratch.best
     nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
     cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, best.off
     bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
     stack, mask = best.stack, best.mask
     shift, frame, step, stop = placed.shift, placed.frame, scene.step, scene.stop
-    location = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
+    location = locate_voxel(scene, voxel, placed)
+    off_x, off_y, off_z = location.x, location.y, location.z
+    off[0], off[1], off[2] = off_x, off_y, off_z
     for r in range(3):
         corner[r] = scene.corners[voxel, r]
-        off[r] = np.float32(corner[r] - placed.frame[r])
-    off_x, off_y, off_z = off[0], off[1], off[2]
     counters[0] += 1
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     broad = BROAD * radius
-    if not nodes_meet(words, location[0], x, y, z, radius, cut[node_class(ints, location[0], mask)]):
+    if not nodes_meet(words, location.rows, x, y, z, radius, cut[node_class(ints, location.rows, mask)]):
         return np.inf
-    stack[0, 0], stack[0, 1], stack[0, 2] = location[0], 0, count
+    stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
     depth, cut_short = 1, False
     while depth > 0 and not stopped(stop):
         depth -= 1
@@ -233,7 +226,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, best):
                 pad_list(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
         children = np.int64(ints[U(row + COUNT)] & COUNTED)
-        child = location[0] + first * ROW_WORDS
+        child = location.rows + first * ROW_WORDS
         counters[0] += children
         for _ in range(children):
             stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
@@ -261,16 +254,14 @@ def _least_left(words, bounds, stack, entries, off, error):
 
 
 @njit_no_refcount
-def _search_widening(
-    m, pose, avatar, placed, scene, rows, beyond, first, last, front, count, best, gaps, classes
-):
+def _search_widening(m, pose, avatar, scene, rows, beyond, first, last, count, scratch):
     """Search the voxels rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
     nodes are far. Returns a lower bound of |a - b| + deficit of what was not searched because of
     the stop flag [steps]; inf: nothing.
-    gaps: for each voxel, its `near`; inf: missing.  classes: of their largest spheres.
     """
+    best, gaps, classes = scratch.best, scratch.gaps, scratch.classes
     units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
     # Under the radius model, no sphere here is larger than the largest minus this.
     base = deficit[classes[0]]
@@ -298,7 +289,7 @@ def _search_widening(
             left = least
             if not stopped(scene.stop):
                 gaps[at] = -1.0 - least
-                left = _nearest_voxel(avatar, m, pose, placed, scene, rows[first + at], front, count, best)
+                left = _nearest_voxel(avatar, m, pose, scene, rows[first + at], count, scratch)
             if left < np.inf:
                 for other in range(last - first):
                     if gaps[other] >= 0.0:
@@ -337,17 +328,15 @@ def nearest_poses(
     whose initial values are -1, inf and 0. Once the scene's stop flag is set, `missing_bound` of the
     pose in hand bounds what was not searched, and the poses after it are not finished.
     """
-    placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
+    best, most = make_best_pair(scene.radius_deficit), 0
     best.frame[5], best.frame[6] = share, tolerance
-    front = make_front(avatar)
-    most = 0
     for number in range(which.shape[0]):
         i = which[number]
         most = max(most, reach.lists.starts[i + 1] - cursor[i])
-    gaps, classes = np.empty(most), np.empty(most, np.uint64)
-    _nearest_poses(
-        poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, gaps, classes,
-    )  # fmt: skip
+    scratch = _SearchScratch(
+        make_placed(avatar), make_front(avatar), best, np.empty(most), np.empty(most, np.uint64)
+    )
+    _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch)
 
 
 @njit_no_refcount
@@ -358,10 +347,9 @@ def nothing_nearer(nearest, i, near, scene):
 
 
 @njit_no_refcount
-def _nearest_poses(
-    poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, gaps, classes,
-):  # fmt: skip
+def _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch):
     """Implement `nearest_poses` with its scratch passed in."""
+    placed, best, gaps, classes = scratch.placed, scratch.best, scratch.gaps, scratch.classes
     rows, near = reach.lists.rows, reach.lists.near
     for number in range(which.shape[0]):
         i = which[number]
@@ -381,7 +369,10 @@ def _nearest_poses(
             continue
         if stopped(scene.stop):
             return
-        best.frame[0], best.frame[1], count = place_all(avatar, poses[i], placed, scene, front.bounds)
+        best.frame[0], best.frame[1] = place_root(avatar, poses[i], placed, scene)
+        if avatar.first[avatar.front_first] >= 0:  # there are nodes below the front
+            place_nodes(avatar, poses[i], placed, scene)
+        count = place_front(avatar, poses[i], placed, scene, best.frame[0], scratch.front.bounds)
         best.units[0], best.units[1] = reach.units[i], reach.units[i]
         best.found[0] = nearest.square[i]
         for r in range(6):
@@ -389,9 +380,7 @@ def _nearest_poses(
         best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        left = _search_widening(
-            poses[i], i, avatar, placed, scene, rows, beyond, first, last, front, count, best, gaps, classes
-        )  # fmt: skip
+        left = _search_widening(poses[i], i, avatar, scene, rows, beyond, first, last, count, scratch)
         nearest.missing_bound[i] = min(nearest.missing_bound[i], left, unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):

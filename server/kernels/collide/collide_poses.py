@@ -4,10 +4,7 @@ As printed, figures 5 and 6 descend into "all children A[i] and B[j]" when A is 
 a leaf has no children, the loop runs zero times, and the contact is lost. Here inner nodes are
 descended, whichever side they are on, and leaves never are.
 
-The scene's tree is descended with the whole front of the avatar's tree (placed_avatar.py). Where a
-scene node is a leaf, or flat compared with the avatar's leaf nodes, the avatar's points themselves
-are tested against its bound, LANES in a vector step. The slab of a floor then clears a foot that
-stands a centimetre above it, while the foot's sphere would not.
+The descent is that of front_descent.py.
 
 An inequality of integers decides (NUMERICS.md N5). A float32 pass settles nearly all pairs. Its
 distances are in lattice steps from a lattice point near the avatar; relative to it, scene
@@ -45,37 +42,26 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
-from ..core.kernel_decorators import njit_no_refcount
+from ..core.front_descent import GO_ON, SKIP, Descent, descend_voxel, make_descent
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_bounds import (
-    BROAD,
-    FLAT,
     ONE_SLACK,
     STACK,
     U32,
     ClassThresholds,
-    compact_marked,
-    copy_node,
     lanes_meet,
     locate_block,
     locate_voxel,
     make_class_thresholds,
-    mark_meeting,
     next_near,
     nodes_meet,
-    power_distance,
     set_class_thresholds,
 )
 from ..core.placed_avatar import (
-    AvatarFront,
-    PlacedAvatar,
-    make_front,
-    make_placed,
     node_reach,
-    pad_list,
     pair_in_reach,
     place_block_once,
     place_front,
-    place_lanes,
     place_node,
     place_root,
 )
@@ -101,22 +87,14 @@ EARLY = 3
 class _CollideScratch(NamedTuple):
     """Scratch of one call.
 
-    placed, front: the avatar under the pose in hand.  by_class: the pose's thresholds.
-    stack: (STACK, 3) int64: scene row, start of its list, length.
+    by_class: thresholds of the pose in hand.
     below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
-    keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
-    counters: (2,) int64, node visits, point tests.
     early: (2,) float32, see `set_early`.
     """
 
-    placed: PlacedAvatar
-    front: AvatarFront
+    descent: Descent
     by_class: ClassThresholds
-    stack: NDArray[np.int64]
     below: NDArray[np.int64]
-    keep: NDArray[np.bool_]
-    keep8: NDArray[np.uint64]
-    counters: NDArray[np.int64]
     early: NDArray[np.float32]
 
 
@@ -124,29 +102,29 @@ class _CollideScratch(NamedTuple):
 def _make_collide_scratch(avatar, deficit):
     """Allocate scratch for one avatar (not empty), and the radius classes of `deficit`."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
-    keep = np.zeros(LANES, np.bool_)
     return _CollideScratch(
-        make_placed(avatar), make_front(avatar), make_class_thresholds(deficit), np.empty((STACK, 3), np.int64),
-        np.empty(below, np.int64), keep, keep.view(np.uint64), np.zeros(2, np.int64), np.empty(2, np.float32),
-    )  # fmt: skip
+        make_descent(avatar),
+        make_class_thresholds(deficit),
+        np.empty(below, np.int64),
+        np.empty(2, np.float32),
+    )
 
 
 @njit_no_refcount
-def _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch):
-    """Return CONTACT if a marked point of a block touches a point of leaf node `row`.
+def _leaves_touch(avatar, m, a, scene, voxel, location, row, scratch):
+    """Return CONTACT if a marked point of leaf node `a` of the avatar touches a point of leaf node `row`.
 
     Return EARLY if a pair within the tolerance is met first, and CLEAR if there is neither.
     """
-    placed, by_class, early = scratch.placed, scratch.by_class, scratch.early[1]
+    placed, keep, keep8 = scratch.descent.placed, scratch.descent.keep, scratch.descent.keep8
+    by_class, early, block = scratch.by_class, scratch.early[1], ~np.int64(avatar.first[U(a)])
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
     block_at, lane_at, low_x, low_y, low_z = locate_block(ints, location, row, scene.block_words)
     far = max(by_class.far[leaf_class(ints, row, mask)], early)  # for the largest sphere in the block
     begin = 0
     while begin < LANES:
-        lane, tested = next_near(
-            halves, lane_at, low_x, low_y, low_z, lanes, block, far, scratch.keep, scratch.keep8, begin
-        )
-        scratch.counters[1] += LANES * tested
+        lane, tested = next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin)
+        scratch.descent.counters[1] += LANES * tested
         if lane < 0:
             return CLEAR
         x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
@@ -178,7 +156,8 @@ def _below_touches(avatar, m, extent, pose, scene, voxel, location, a, row, scra
     The avatar's node is descended depth first. This is for avatars whose front is not their leaf
     nodes.
     """
-    words, below, placed, by_class = scene.words, scratch.below, scratch.placed, scratch.by_class
+    words, below, by_class, descent = scene.words, scratch.below, scratch.by_class, scratch.descent
+    placed = descent.placed
     threshold = by_class.threshold[node_class(scene.ints, row, by_class.mask)]
     per_step = 1.0 / scene.step
     below[0] = a
@@ -187,7 +166,7 @@ def _below_touches(avatar, m, extent, pose, scene, voxel, location, a, row, scra
         depth -= 1
         a = below[depth]
         a_first = avatar.first[a]
-        scratch.counters[0] += 1
+        descent.counters[0] += 1
         if a_first < 0:
             block = np.int64(~a_first)
             if avatar.inner_points > 0 and not _may_touch(
@@ -196,9 +175,9 @@ def _below_touches(avatar, m, extent, pose, scene, voxel, location, a, row, scra
                 continue
             place_block_once(avatar, m, pose, block, placed, scene)
             if lanes_meet(
-                words, row, placed.lanes, block, location.x, location.y, location.z, threshold, scratch.keep
+                words, row, placed.lanes, block, location.x, location.y, location.z, threshold, descent.keep
             ):
-                found = _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch)
+                found = _leaves_touch(avatar, m, a, scene, voxel, location, row, scratch)
                 if found != CLEAR:
                     return found
             continue
@@ -221,8 +200,8 @@ def _may_touch(avatar, m, extent, scene, location, a, row, threshold, scratch):
     `filled`).
     """
     _, lane_at, low_x, low_y, low_z = locate_block(scene.ints, location, row, scene.block_words)
-    scratch.counters[1] += LANES
-    x, y, z = place_node(avatar, m, a, scratch.placed, scene)
+    scratch.descent.counters[1] += LANES
+    x, y, z = place_node(avatar, m, a, scratch.descent.placed, scene)
     x, y, z = x - low_x, y - low_y, z - low_z
     reach = node_reach(avatar.radius[a], 1.0 / scene.step, extent) + threshold
     halves, near, square = scene.halves, False, reach * reach * ONE_SLACK
@@ -291,112 +270,37 @@ def _surely_near(words, ints, halves, block_words, location, row, x, y, z, lanes
     return lane >= 0, LANES * tested
 
 
+@njit_inlined
+def _flat_touches(scene, location, row, at, block, threshold, scratch):
+    """Return EARLY if a point of a block is surely within the tolerance of one below a flat node.
+
+    Return SKIP if none is, nor within the reach.
+    """
+    words, descent, early = scene.words, scratch.descent, scratch.early
+    if not early[1] > np.float32(0.0):
+        return GO_ON
+    # Points beyond the wider reach are also beyond the exact one: most blocks need this test alone.
+    # The largest sphere may reach farther than the smallest one with the tolerance.
+    wide, lanes, keep = max(threshold, early[0]), descent.placed.lanes, descent.keep
+    if not lanes_meet(words, row, lanes, block, location.x, location.y, location.z, wide, keep):
+        return SKIP
+    bounds, u = descent.front.bounds, U(at)
+    near, tests = _surely_near(
+        words, scene.ints, scene.halves, scene.block_words, location, row, bounds[0, u], bounds[1, u], bounds[2, u],
+        lanes, block, early, keep, descent.keep8,
+    )  # fmt: skip
+    descent.counters[1] += tests
+    return EARLY if near else GO_ON
+
+
 @njit_no_refcount
 def _collide_voxel(avatar, m, extent, pose, scene, voxel, location, count, scratch):
-    """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets.
-
-    The scene's tree is descended depth first, each node with a list of
-    those front nodes that met its parent. The function is long because each of its inner steps
-    takes some ten nanoseconds: a call that passes tuples of arrays, or takes arrays out of them,
-    costs the same again (11 us a pose instead of 4 with each step in a function).
-    """
-    words, ints, stack, counters = scene.words, scene.ints, scratch.stack, scratch.counters
-    placed, front, by_class = scratch.placed, scratch.front, scratch.by_class
-    bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
-    listed, listed8, keep = front.keep, front.keep8, scratch.keep
-    firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
-    shift, frame, step = placed.shift, placed.frame, scene.step
-    off_x, off_y, off_z = location.x, location.y, location.z
-    thresholds, mask = by_class.threshold, by_class.mask
-    by_size, threshold, stop = mask > U(0), thresholds[0], scene.stop
-    early = scratch.early
-    tolerant = early[1] > np.float32(0.0)
-    x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
-    stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
-    depth = 1
-    while depth > 0 and not stopped(stop):
-        depth -= 1
-        row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
-        first = np.int64(ints[U(row + FIRST)])
-        if by_size:
-            threshold = thresholds[node_class(ints, row, mask)]
-        if first < 0 or words[U(row + 3)] < BROAD * radius:
-            counters[0] += count
-            steps = (count + LANES - 1) // LANES
-            if not mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, listed):
-                continue
-            to = at + steps * LANES
-            count = compact_marked(bounds, which, listed, listed8, at, steps, to)
-            at = to
-            thick = words[U(row + 9)] - words[U(row + 8)]
-            if first < 0 or thick < FLAT * abs(words[U(row + 7)]) * bounds[3, U(at)]:
-                left = at
-                for i in range(at, at + count):
-                    a = front_first + np.int64(which[U(i)])
-                    a_first = np.int64(firsts[U(a)])
-                    if a_first < 0:
-                        block = ~a_first
-                        if stamp[U(block)] != pose:
-                            place_lanes(points, m, block, lanes, shift, frame, step)
-                            stamp[U(block)] = pose
-                        counters[0] += 1
-                        if tolerant and first >= 0:
-                            # Points beyond the wider reach are also beyond the exact one: most
-                            # blocks need this test alone. The largest sphere may reach farther than
-                            # the smallest one with the tolerance.
-                            wide = max(threshold, early[0])
-                            if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, wide, keep):
-                                continue
-                            u = U(i)
-                            x_a, y_a, z_a = bounds[0, u], bounds[1, u], bounds[2, u]
-                            near, tests = _surely_near(
-                                words, ints, scene.halves, scene.block_words, location, row, x_a, y_a, z_a,
-                                lanes, block, early, keep, scratch.keep8,
-                            )  # fmt: skip
-                            counters[1] += tests
-                            if near:
-                                return EARLY
-                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
-                            continue
-                        if first < 0:
-                            found = _leaves_touch(avatar, m, block, scene, voxel, location, row, scratch)
-                            if found != CLEAR:
-                                return found
-                            if stopped(stop):  # the blocks of a whole front may take milliseconds
-                                return CLEAR
-                            continue
-                    elif first < 0:
-                        found = _below_touches(
-                            avatar, m, extent, pose, scene, voxel, location, a, row, scratch
-                        )
-                        if found != CLEAR:
-                            return found
-                        continue
-                    copy_node(bounds, which, U(i), U(left))
-                    left += 1
-                if left == at:  # always true at a leaf
-                    continue
-                pad_list(bounds, left, at + (count + LANES - 1) // LANES * LANES)
-                count = left - at
-        children = np.int64(ints[U(row + COUNT)] & COUNTED)
-        child = location.rows + first * ROW_WORDS
-        counters[0] += children
-        nearest, least = depth, np.float32(np.inf)
-        for _ in range(children):
-            u = U(depth)
-            stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
-            if by_size:
-                threshold = thresholds[node_class(ints, child, mask)]
-            if nodes_meet(words, child, x, y, z, radius, threshold):
-                power = power_distance(words, child, x, y, z)
-                if power < least:
-                    nearest, least = depth, power
-                depth += 1
-            child += ROW_WORDS
-        if least < np.float32(np.inf):
-            top, best = U(depth - 1), U(nearest)
-            stack[top, 0], stack[best, 0] = stack[best, 0], stack[top, 0]
-    return CLEAR
+    """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets."""
+    found, _ = descend_voxel(
+        avatar, m, extent, pose, scene, voxel, location, count, scratch, scratch.by_class.threshold,
+        scratch.by_class.mask, True, _flat_touches, _leaves_touch, _below_touches,
+    )  # fmt: skip
+    return found
 
 
 @nb.njit(nogil=True, cache=True)
@@ -419,7 +323,7 @@ def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, 
 @njit_no_refcount
 def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, scratch):
     """Implement `collide_poses` with its scratch passed in."""
-    placed, by_class = scratch.placed, scratch.by_class
+    placed, counters, by_class = scratch.descent.placed, scratch.descent.counters, scratch.by_class
     nodes, ints, rows = placed.nodes, scene.ints, reach.lists.rows
     scratch.early[:] = np.float32(-1.0)
     largest_deficit = np.int64(0)
@@ -433,7 +337,7 @@ def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance,
         if stopped(scene.stop):
             return
         m = poses[i]
-        scratch.counters[0], scratch.counters[1] = 0, 0
+        counters[0], counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, placed, scene)
         error = set_class_thresholds(by_class, scene, reach.units[i], extent, farthest)
         if tolerance > 0:
@@ -451,11 +355,11 @@ def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance,
                 continue
             location = locate_voxel(scene, voxel, placed)
             x, y, z = nodes[0, 0] - location.x, nodes[1, 0] - location.y, nodes[2, 0] - location.z
-            scratch.counters[0] += 1
+            counters[0] += 1
             threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
             if nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 if count == 0:
-                    count = place_front(avatar, m, placed, scene, extent, scratch.front.bounds)
+                    count = place_front(avatar, m, placed, scene, extent, scratch.descent.front.bounds)
                 found = _collide_voxel(avatar, m, extent, i, scene, voxel, location, count, scratch)
                 if found != CLEAR:
                     verdict[i], at = found, end
@@ -464,8 +368,8 @@ def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance,
                     break
             at += 1
         cursor[i] = at
-        counts[1, i] += np.uint32(scratch.counters[0])
-        counts[2, i] += np.uint32(scratch.counters[1])
+        counts[1, i] += np.uint32(counters[0])
+        counts[2, i] += np.uint32(counters[1])
 
 
 @nb.njit(nogil=True, cache=True)

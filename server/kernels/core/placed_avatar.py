@@ -400,7 +400,7 @@ def _compare_roots(square, other, radius_difference):
     return 0
 
 
-@njit_no_refcount
+@njit_inlined
 def compare_separations(square, radius, other_square, other_radius):
     """Compare the separations sqrt(square) - radius of two pairs exactly.
 

@@ -70,16 +70,13 @@ class BestPair(NamedTuple):
     error of a distance [steps]; tolerance as a share of |a - b|, tolerance [exact units]; the
     largest deficit.
     corner: (3,) int64, low corner of the current voxel [steps].
-    keep, squares: (LANES,), a mark and a square for each point of an avatar's block.
-    keep8: the memory of keep as uint64, eight marks each.
+    keep, keep8, counters: of the descent; the last counter is that of candidates.
+    squares: (LANES,) float32, a square for each point of an avatar's block.
     block_squares: (LANES,) float32, a square for each point of a scene block.
     units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + deficit.
-    counters: (3,) int64, node visits, point tests, candidates.
     candidates: (MAX_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
     candidate_squares: (MAX_CANDIDATES,) float32, their least squares there.
-    stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list of front nodes,
-    length.
     below: (STACK,) int64, avatar nodes below its front; keys: (STACK,) float32, their lower bounds.
     off: (3,) float32, from the frame to the voxel's low corner.
     """
@@ -99,25 +96,23 @@ class BestPair(NamedTuple):
     counters: NDArray[np.int64]
     candidates: NDArray[np.int64]
     candidate_squares: NDArray[np.float32]
-    stack: NDArray[np.int64]
     below: NDArray[np.int64]
     keys: NDArray[np.float32]
     off: NDArray[np.float32]
 
 
 @nb.njit(nogil=True, cache=True)
-def make_best_pair(deficit):
+def make_best_pair(deficit, descent):
     """Allocate scratch for as many classes as `deficit` has; no pair is found yet."""
-    keep, n = np.zeros(LANES, np.bool_), deficit.shape[0]
-    frame = np.zeros(8)
+    n, frame = deficit.shape[0], np.zeros(8)
     for c in range(n):
         frame[7] = max(frame[7], np.float64(deficit[c]))
     return BestPair(
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), frame,
-        np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
-        np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MAX_CANDIDATES, 5), np.int64),
-        np.empty(MAX_CANDIDATES, np.float32), np.empty((STACK, 3), np.int64), np.empty(STACK, np.int64),
-        np.empty(STACK, np.float32), np.empty(3, np.float32),
+        np.empty(3, np.int64), descent.keep, descent.keep8, np.empty(LANES, np.float32), np.empty(LANES, np.float32),
+        np.empty(2, np.int64), descent.counters, np.empty((MAX_CANDIDATES, 5), np.int64),
+        np.empty(MAX_CANDIDATES, np.float32), np.empty(STACK, np.int64), np.empty(STACK, np.float32),
+        np.empty(3, np.float32),
     )  # fmt: skip
 
 

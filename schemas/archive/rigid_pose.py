@@ -1,7 +1,7 @@
 """Check that a pose is rigid: a rotation and a translation (NUMERICS.md N6).
 
 It applies to poses of archives, of objects, of users in frames, and in scene files. A kernel checks
-the thousands of poses of a query (server/kernels/core/voxels_in_reach.py).
+the thousands of poses of a query (server/kernels/core/reach.py).
 """
 
 from collections.abc import Sequence

@@ -28,7 +28,7 @@ from ..runtime.threads import start_thread
 
 # A request of more poses does not update the user's position: its last pose may be anywhere.
 _MAX_USER_POSES = 8
-# Limit of margin or reach [m] (voxels_in_reach.py refuses other requests).
+# Limit of margin or reach [m] (reach.py refuses other requests).
 _MAX_AROUND = 16.0
 _FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing with the type
 _NUMBER = (float, int)  # `float | int` would be constructed for each request

@@ -11,7 +11,7 @@ from ...schemas.archive.rigid_pose import RIGID_TOLERANCE, rigid_pose
 Pose = NDArray[np.float64]  # (4, 4), archive to world
 
 # Largest deviation of an archive's pose from a rigid one: half that of an avatar's pose
-# (kernels/core/voxels_in_reach.py), because a pose in the archive's frame has both deviations.
+# (kernels/core/reach.py), because a pose in the archive's frame has both deviations.
 _TOLERANCE = RIGID_TOLERANCE / 2
 
 

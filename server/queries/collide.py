@@ -8,10 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.collide.collide_poses import collide_poses
-from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
-from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..kernels.collide.collide_poses import CLEAR, CONTACT, EARLY, UNKNOWN, collide_poses
+from ..kernels.core.reach import VoxelLists, VoxelsInReach
 from .level_of_detail import below, find_level, level_budget, level_reach
 from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
 from .resolve import Search, Settle, Steps, answered, drop_items, load_and_search, resolve

@@ -38,10 +38,9 @@ from ..kernels.contacts.contact_cells import (
     make_cells,
 )
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
-from ..kernels.core.node_overlap import STACK
-from ..kernels.core.reach import VoxelLists
+from ..kernels.core.node_bounds import STACK
+from ..kernels.core.reach import VoxelLists, VoxelsInReach
 from ..kernels.core.scene_arrays import LANES
-from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import drop_clear_of
 from .distance import signed_from_square
@@ -151,7 +150,7 @@ def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) 
 def empty_memory(limit: int) -> ContactState:
     """Return the memory of a search that has not begun."""
     return ContactState(
-        make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),
+        make_cells(FIRST_CELLS), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),
         np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip

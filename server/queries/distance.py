@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..kernels.core.reach import VoxelLists, VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import (
     AVATAR,

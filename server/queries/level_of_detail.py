@@ -17,8 +17,7 @@ from ...schemas.archive.level import cover_units, halvings_between
 from ...schemas.archive.voxel_grid import voxel_keys
 from ...schemas.errors import BadRequestError, TooLargeError
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..kernels.core.reach import VoxelLists, VoxelsInReach
 from ..residency.voxel_cache import VoxelCache
 from ..runtime.stop_flag import StoppedError
 from .request import QueryBudget, check_request

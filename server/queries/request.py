@@ -21,9 +21,9 @@ from ...schemas.errors import BadRequestError, BadTransformError, SolidcloudErro
 from ...schemas.wire.answers import Cost
 from ...schemas.wire.question_rules import Question
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core import voxels_in_reach as pose_checks
+from ..kernels.core import reach as pose_checks
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.voxels_in_reach import VoxelsInReach, check_poses, find_reach, make_reach
+from ..kernels.core.reach import VoxelsInReach, check_poses, find_reach, make_reach
 from ..residency.voxel_cache import HeldVoxels, VoxelCache
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
 from .scene_data import SceneData

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.level import NODE_CLASS
 from ...schemas.archive.voxel import top_shift
-from ..kernels.core.node_boxes import lay_boxes
+from ..kernels.core.node_bounds import lay_boxes
 from ..kernels.core.scene_arrays import (
     LANES,
     Arena,

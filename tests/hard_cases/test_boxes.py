@@ -20,9 +20,16 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import cover_units, open_level
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.kernels.core.reach import INFINITE, VoxelTree, entry_fraction, make_voxel_tree
+from solidcloud.server.kernels.core.reach import (
+    INFINITE,
+    VALID,
+    VoxelTree,
+    entry_fraction,
+    find_reach,
+    make_reach,
+    make_voxel_tree,
+)
 from solidcloud.server.kernels.core.scene_arrays import LANES, ROW_WORDS, SceneArrays
-from solidcloud.server.kernels.core.voxels_in_reach import VALID, find_reach, make_reach
 from solidcloud.server.kernels.nearest.nearest_pair import unmark_beyond_box
 from solidcloud.server.kernels.rays.hits import HitBatch
 from solidcloud.server.queries import nearest_hits

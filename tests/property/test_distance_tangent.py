@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.kernels.core.node_overlap import U32
+from solidcloud.server.kernels.core.node_bounds import U32
 from solidcloud.server.scene import Scene
 
 

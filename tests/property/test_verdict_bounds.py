@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN, set_early
+from solidcloud.server.kernels.collide.collide_poses import CLEAR, CONTACT, EARLY, UNKNOWN, set_early
 from solidcloud.server.queries.collide import verdict_bounds
 from solidcloud.server.queries.request import QueryBudget
 

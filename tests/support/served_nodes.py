@@ -7,7 +7,7 @@ from fractions import Fraction
 def row_encloses(row: Sequence[Fraction], point: Sequence[Fraction]) -> bool:
     """Return whether a point lies in the sphere of a row, and in its slab or its box.
 
-    row: its first ten words, exactly (server/kernels/core/scene_arrays.py, node_boxes.py).
+    row: its first ten words, exactly (server/kernels/core/scene_arrays.py, node_bounds.py).
     point: in steps from the voxel's low corner.
     """
     apart = [p - c for p, c in zip(point, row[:3], strict=True)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import STACK
+from ..core.node_bounds import STACK
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class
 from .avatar_patch import add_difference

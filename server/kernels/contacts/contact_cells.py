@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import U32, ClassThresholds
-from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units, place, to_units
-from ..core.scene_arrays import ROWS_AT_ONCE, copy_rows, stopped
-from ..core.separation_order import compare_separations
+from ..core.node_bounds import U32, ClassThresholds
+from ..core.placed_avatar import PlacedAvatar, compare_separations, place_units, square_apart
+from ..core.scene_arrays import stopped
 
 # Columns of a record. The first ORDER of them determine which pair is deeper: |a - b|^2 [exact
 # units^2], and the largest radius minus that of the scan point [exact units]. Pairs of equal
@@ -90,31 +89,29 @@ class ContactOptions(NamedTuple):
 class ContactScratch(NamedTuple):
     """Scratch of one call.
 
-    keep: (LANES,) bool.  avatar_lanes: (3, LANES), squares: (LANES,), off: (3,) float32.
+    placed: the avatar under the pose in hand.  by_class: the pose's thresholds.
+    keep: (LANES,) bool.  avatar_lanes: (3, LANES), squares: (LANES,) float32.
     bound: (1,) float64, as in `ContactCells`, of the pairs listed.  error: (1,) float64, that of
     the pose's `Thresholds`.
-    record: (1, RECORD) int64.  by_class: the pose's thresholds.
+    record: (1, RECORD) int64.
     """
 
+    placed: PlacedAvatar
+    by_class: ClassThresholds
     keep: NDArray[np.bool_]
     avatar_lanes: NDArray[np.float32]
     squares: NDArray[np.float32]
-    off: NDArray[np.float32]
     bound: NDArray[np.float64]
     error: NDArray[np.float64]
     record: NDArray[np.int64]
-    by_class: ClassThresholds
 
 
 @njit_no_refcount
 def deeper(a, i, b, j):
     """Return whether record a[i] precedes record b[j]: the deeper pair precedes."""
-    if a[i, DEFICIT] != b[j, DEFICIT]:
-        order = compare_separations(a[i, SQUARE], -a[i, DEFICIT], b[j, SQUARE], -b[j, DEFICIT])
-        if order != 0:
-            return order < 0
-    elif a[i, SQUARE] != b[j, SQUARE]:
-        return a[i, SQUARE] < b[j, SQUARE]
+    order = compare_separations(a[i, SQUARE], -a[i, DEFICIT], b[j, SQUARE], -b[j, DEFICIT])
+    if order != 0:
+        return order < 0
     for c in range(POINT, ORDER):
         if a[i, c] != b[j, c]:
             return a[i, c] < b[j, c]
@@ -144,10 +141,7 @@ def _sift_down(rows, n, at):
 
 @nb.njit(nogil=True, cache=True)
 def sort_rows(rows, n, stop):
-    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set.
-
-    Once it is set, this does not access even the first row: there may be fewer than n rows.
-    """
+    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set."""
     for at in range(n // 2 - 1, -1, -1):
         if stopped(stop):
             return
@@ -218,14 +212,9 @@ def listing_bound(heap, kept, units_per_step, error):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_cells(count, stop):
-    """Allocate `count` cells, a power of two; the result is unusable once the stop flag is set."""
-    slots = np.empty(2 * count, np.int64)
-    for at in range(2 * count):
-        if at % (64 * ROWS_AT_ONCE) == 0 and stopped(stop):
-            break
-        slots[at] = -1
-    return ContactCells(np.empty((count, CELL), np.int64), np.empty(count), slots)
+def make_cells(count):
+    """Allocate `count` cells, a power of two."""
+    return ContactCells(np.empty((count, CELL), np.int64), np.empty(count), np.full(2 * count, -1, np.int64))
 
 
 @njit_no_refcount
@@ -244,28 +233,6 @@ def find_slot(cells, x, y, z):
 
 
 @njit_no_refcount
-def enter_cell(cells, used, x, y, z):
-    """Return the row of cell (x, y, z), created as row `used` if it is new.
-
-    There must be a free row.
-    """
-    slot = find_slot(cells, x, y, z)
-    row = cells.slots[slot]
-    if row < 0:
-        row = used
-        cells.slots[slot] = row
-        table = cells.table
-        table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
-        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a deficit is below
-        # 2^31.
-        table[row, SQUARE], table[row, DEFICIT], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
-        for r in range(3):
-            table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
-        cells.bound[row] = np.inf
-    return row
-
-
-@njit_no_refcount
 def cell_of(cells, sizes, record, edge):
     """Return the row of the cell of the record's scan point, or of its scan.
 
@@ -279,69 +246,63 @@ def cell_of(cells, sizes, record, edge):
         x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
         if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
             return last
-    cell = enter_cell(cells, sizes[CELLS], x // edge, y // edge, z // edge)
-    if cell == sizes[CELLS]:
+    x, y, z = x // edge, y // edge, z // edge
+    slot = find_slot(cells, x, y, z)
+    cell = cells.slots[slot]
+    if cell < 0:
+        cell = sizes[CELLS]
         sizes[CELLS] += 1
+        cells.slots[slot], cells.bound[cell] = cell, np.inf
+        table[cell, PLACE], table[cell, PLACE + 1], table[cell, PLACE + 2] = x, y, z
+        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a deficit is below
+        # 2^31.
+        table[cell, SQUARE], table[cell, DEFICIT], table[cell, PAIRS] = np.iinfo(np.int64).max, 0, 0
+        for r in range(3):
+            table[cell, LOW + r], table[cell, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
     sizes[LAST] = cell
     return cell
 
 
 @nb.njit(nogil=True, cache=True)
-def grow_cells(cells, used, stop):
+def grow_cells(cells, used):
     """Return the same `used` cells with twice the capacity.
 
-    Returns the cells unchanged once the stop flag is set.
+    Like all that grows or empties arrays here, it does not look at the stop flag: the most cells that
+    there may be take a tenth of a second.
     """
-    grown = make_cells(2 * cells.table.shape[0], stop)
-    copy_rows(cells.table, grown.table, used, stop)
+    grown = make_cells(2 * cells.table.shape[0])
+    table = grown.table
+    table[:used], grown.bound[:used] = cells.table[:used], cells.bound[:used]
     for row in range(used):
-        if row % ROWS_AT_ONCE == 0 and stopped(stop):
-            return cells
-        table = grown.table
-        grown.bound[row] = cells.bound[row]
         grown.slots[find_slot(grown, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = row
     return grown
 
 
 @nb.njit(nogil=True, cache=True)
-def empty_cells(cells, used, stop):
-    """Remove all `used` cells, in time proportional to them and not to the capacity.
-
-    Ends early once the stop flag is set.
-    """
+def empty_cells(cells, used):
+    """Remove all `used` cells, in time proportional to them and not to the capacity."""
     table = cells.table
     # Last in, first out: the entries between a cell's hash and its slot were inserted before it.
     for row in range(used - 1, -1, -1):
-        if row % ROWS_AT_ONCE == 0 and stopped(stop):
-            return
         cells.slots[find_slot(cells, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = -1
 
 
 @njit_no_refcount
-def _measure(avatar, m, block, lane, placed, scene, record):
+def _measure(avatar, m, block, lane, shift, scene, record):
     """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`.
 
-    record: holds the scan's point. Returns whether the square fits: False beyond any reach
-    (`pair_square` makes the same test).
+    shift: of PlacedAvatar.  record: holds the scan's point. Returns the square, see `square_apart`.
     """
-    square = np.int64(0)
-    points = avatar.points
+    center = place_units(avatar.points, m, shift, block, lane)
+    point = (record[0, POINT], record[0, POINT + 1], record[0, POINT + 2])
     for r in range(3):
-        world = place(
-            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-        )
-        units = to_units(world)
-        record[0, CENTER + r] = units
-        difference = units - lattice_to_units(record[0, POINT + r], scene.units_per_step)
-        if abs(difference) > MAX_REACH_UNITS:
-            return False
-        square += difference * difference
-    record[0, SQUARE] = square
-    return True
+        record[0, CENTER + r] = center[r]
+    record[0, SQUARE] = square_apart(center, point, scene.units_per_step)
+    return record[0, SQUARE]
 
 
 @njit_no_refcount
-def gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch):
+def gather_point(avatar, m, a, block, scene, own, options, edge, state, scratch):
     """Count the pairs of one scan point with the points of a block.
 
     The scan point is in scratch.record, the float32 squares of the block's points in
@@ -353,7 +314,7 @@ def gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, 
     table, bounds, error = cells.table, cells.bound, scratch.error[0]
     deficit, units = scene.radius_deficit[own], scratch.by_class.units[own]
     near, far = scratch.by_class.near[own], scratch.by_class.far[own]
-    record[0, DEFICIT] = deficit
+    shift, record[0, DEFICIT] = scratch.placed.shift, deficit
     deficit_steps = np.float64(deficit) / per_step
     listed, deepest = square_below(listing[0], deficit_steps), np.float32(np.inf)
     cell, count = np.int64(-1), np.int64(0)
@@ -361,23 +322,16 @@ def gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, 
         square = squares[lane]
         if square > far:
             continue
+        if square > near and not 0 <= _measure(avatar, m, block, lane, shift, scene, record) <= units * units:
+            continue
+        if cell < 0:
+            cell = cell_of(cells, sizes, record, edge)
+            deepest = square_below(bounds[cell], deficit_steps)
+        count += 1
         if square <= near:
-            if cell < 0:
-                cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], deficit_steps)
-            count += 1
             if square > deepest and square > listed:
                 continue
-            _measure(avatar, m, block, lane, placed, scene, record)
-        else:
-            if not _measure(avatar, m, block, lane, placed, scene, record):
-                continue
-            if record[0, SQUARE] > units * units:
-                continue
-            if cell < 0:
-                cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], deficit_steps)
-            count += 1
+            _measure(avatar, m, block, lane, shift, scene, record)
         record[0, ROW] = rows[block, lane]
         record[0, TAG] = cell
         if deeper(record, 0, table, cell):
@@ -419,29 +373,21 @@ def _join_neighbours(cells, used, parent, stop):
             return
         # 13 of the 26 neighbours: of two neighbouring cells, only one looks for the other.
         for n in range(14, 27):
-            slot = find_slot(
-                cells,
-                table[row, PLACE] + n // 9 - 1,
-                table[row, PLACE + 1] + n // 3 % 3 - 1,
-                table[row, PLACE + 2] + n % 3 - 1,
-            )
-            other = cells.slots[slot]
+            x, y = table[row, PLACE] + n // 9 - 1, table[row, PLACE + 1] + n // 3 % 3 - 1
+            other = cells.slots[find_slot(cells, x, y, table[row, PLACE + 2] + n % 3 - 1)]
             if other >= 0:
                 a, b = _root(parent, row), _root(parent, other)
                 parent[max(a, b)] = min(a, b)
 
 
 @nb.njit(nogil=True, cache=True)
-def _with_capacity(rows, used, more, stop):
-    """Return `rows` with space for `more` rows after the used ones.
-
-    Returns the rows unchanged once the stop flag is set.
-    """
+def _with_capacity(rows, used, more):
+    """Return `rows` with space for `more` rows after the used ones."""
     if used + more <= rows.shape[0]:
         return rows
     grown = np.empty((2 * (used + more), rows.shape[1]), np.int64)
-    copy_rows(rows, grown, used, stop)
-    return rows if stopped(stop) else grown
+    grown[:used] = rows[:used]
+    return grown
 
 
 @nb.njit(nogil=True, cache=True)
@@ -450,7 +396,7 @@ def list_pose(state, runs, stop):
 
     Writes runs (4,) int64: first pair, number of pairs, first cluster, number of clusters. Returns
     the state, whose lists may have grown. When the stop flag (1,) is set, the pose has no pairs and
-    no clusters, and the state must not be used for further poses.
+    no clusters.
     """
     cells, heap, sizes = state.cells, state.heap, state.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
@@ -458,12 +404,10 @@ def list_pose(state, runs, stop):
     _join_neighbours(cells, used, parent, stop)
     for row in range(used):
         found += 1 if parent[row] == row else 0
-    clusters = _with_capacity(state.clusters, sizes[CLUSTERS], found, stop)
+    clusters = _with_capacity(state.clusters, sizes[CLUSTERS], found)
     own = clusters[sizes[CLUSTERS] :]
     rank, at = np.empty(used, np.int64), 0
     for row in range(used):  # a root precedes all rows below it
-        if stopped(stop):  # there may then be too few rows
-            break
         root = _root(parent, row)
         if root == row:
             copy_record(table, row, own, at)
@@ -480,21 +424,18 @@ def list_pose(state, runs, stop):
             own[mine, LOW + r] = min(own[mine, LOW + r], table[row, LOW + r])
             own[mine, HIGH + r] = max(own[mine, HIGH + r], table[row, HIGH + r])
     sort_rows(own, found, stop)
-    if not stopped(stop):
-        for at in range(found):
-            rank[own[at, TAG]] = at
+    for at in range(found):
+        rank[own[at, TAG]] = at
     sort_rows(heap, kept, stop)
-    pairs = _with_capacity(state.pairs, sizes[LISTED], kept, stop)
-    if stopped(stop):  # the rows above may be in any order
-        runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
-        sizes[CELLS], sizes[KEPT], sizes[LAST], sizes[POSE] = 0, 0, -1, -1
-        return ContactState(cells, heap, sizes, state.stack, pairs, clusters)
+    pairs = _with_capacity(state.pairs, sizes[LISTED], kept)
+    if stopped(stop):  # the rows may be in any order
+        kept, found = 0, 0
     for i in range(kept):
         copy_record(heap, i, pairs, sizes[LISTED] + i)
         pairs[sizes[LISTED] + i, TAG] = rank[_root(parent, heap[i, TAG])]
     runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], kept, sizes[CLUSTERS], found
     sizes[LISTED] += kept
     sizes[CLUSTERS] += found
-    empty_cells(cells, used, stop)
+    empty_cells(cells, used)
     sizes[CELLS], sizes[KEPT], sizes[LAST], sizes[POSE] = 0, 0, -1, -1
     return ContactState(cells, heap, sizes, state.stack, pairs, clusters)

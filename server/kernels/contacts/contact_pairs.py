@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import (
+from ..core.node_bounds import (
     ONE_SLACK,
     lanes_meet,
+    locate_block,
+    locate_voxel,
     make_class_thresholds,
-    make_thresholds,
     nodes_meet,
     set_class_thresholds,
 )
-from ..core.placed_avatar import make_placed, place_block, place_nodes
+from ..core.placed_avatar import lattice_point, make_placed, place_block_once, place_nodes
 from ..core.reach import MISSING, NOT_HELD, state_of
 from ..core.scene_arrays import (
     COUNT,
@@ -91,40 +92,32 @@ def _bound_of_scans(halves, at, count, cells):
 
 
 @njit_no_refcount
-def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge, state, scratch, i, results):
+def _gather_leaves(
+    avatar, m, a, block, scene, voxel, location, row, options, edge, state, scratch, i, results
+):
     """Gather the pairs in contact of a leaf node of the avatar and one of the scene.
 
-    voxel: the scene's voxel, at scratch.off. First, vector loops test all avatar points against the
+    voxel, location: the scene's voxel. First, vector loops test all avatar points against the
     scene node's bound and all scan points against the avatar node's sphere. Then each remaining
     scan point is tested against all points of the avatar.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
-    lanes, nodes, off, keep, avatar_lanes = (
-        placed.lanes,
-        placed.nodes,
-        scratch.off,
-        scratch.keep,
-        scratch.avatar_lanes,
-    )
+    lanes, nodes = scratch.placed.lanes, scratch.placed.nodes
+    keep, avatar_lanes = scratch.keep, scratch.avatar_lanes
     fars, mask = scratch.by_class.far, scratch.by_class.mask
     threshold = scratch.by_class.threshold[node_class(ints, row, mask)]
-    scene_block = ~ints[row + FIRST]
     scan_at = np.int64(0)
     if options.with_scan:
-        scan_at = scan_run(scene.where, voxel, scene.block_words) + scene_block * LANES
+        scan_at = scan_run(scene.where, voxel, scene.block_words) + ~np.int64(ints[row + FIRST]) * LANES
     if edge == BY_SCAN:
         # A wall that one scan saw costs only its nodes and the scan numbers of its points.
         widest = _bound_of_scans(halves, scan_at, ints[row + COUNT] & COUNTED, state.cells)
         threshold = np.float32(min(np.float64(threshold), widest * (1.0 + 1e-6)))
-    if not lanes_meet(words, row, lanes, block, off[0], off[1], off[2], threshold, keep):
+    if not lanes_meet(words, row, lanes, block, location.x, location.y, location.z, threshold, keep):
         return
-    block_at = scene.where[voxel, 1] + scene_block * scene.block_words
-    lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
+    block_at, lane_at, lx, ly, lz = locate_block(ints, location, row, scene.block_words)
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    lx = off[0] + np.float32(ints[block_at])
-    ly = off[1] + np.float32(ints[block_at + 1])
-    lz = off[2] + np.float32(ints[block_at + 2])
     cx, cy, cz = nodes[0, a] - lx, nodes[1, a] - ly, nodes[2, a] - lz
     both = nodes[3, a] + threshold
     square = both * both * ONE_SLACK
@@ -138,7 +131,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         avatar_lanes[1, j] = lanes[block, 1, j] - ly
         avatar_lanes[2, j] = lanes[block, 2, j] - lz
     record, squares = scratch.record, scratch.squares
-    corners, counts, pairs = scene.corners, results.counts, results.pairs
+    corner, counts, pairs = scene.corners[voxel], results.counts, results.pairs
     for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
@@ -161,35 +154,34 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
             touched |= squares[lane] <= far
         if not touched:
             continue
-        for r in range(3):
-            low = corners[voxel, r] + np.int64(ints[block_at + r])
-            record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
+        record[0, POINT], record[0, POINT + 1], record[0, POINT + 2] = lattice_point(
+            corner, ints, halves, block_at, lane_at, j
+        )
         record[0, SCAN] = -1
         if options.with_scan:
             record[0, SCAN] = halves[scan_at + j]
-        pairs[i] += gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch)
+        pairs[i] += gather_point(avatar, m, a, block, scene, own, options, edge, state, scratch)
 
 
 @njit_no_refcount
-def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, results):
+def _gather_voxel(avatar, m, i, scene, voxel, options, state, scratch, results):
     """Gather all pairs in contact of the placed avatar and one resident voxel by a joint descent.
 
     Continues from the stack that an earlier call left. Suspends, with a depth other than 0, where the
     cells have no space for another LANES, and when the scene's stop flag is set.
     """
-    words, ints = scene.words, scene.ints
-    base = scene.where[voxel, 0]
-    nodes, off, stack, counts = placed.nodes, scratch.off, state.stack, results.counts
-    first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, options.edges
+    words, ints, placed = scene.words, scene.ints, scratch.placed
+    location = locate_voxel(scene, voxel, placed)
+    base, off_x, off_y, off_z = location.rows, location.x, location.y, location.z
+    nodes, stack, counts = placed.nodes, state.stack, results.counts
+    first, held, edges = avatar.first, avatar.count, options.edges
     sizes, most_cells = state.sizes, state.cells.table.shape[0]
     thresholds, mask, flag = scratch.by_class.threshold, scratch.by_class.mask, scene.stop
-    for r in range(3):
-        off[r] = np.float32(scene.corners[voxel, r] - placed.frame[r])
     depth = sizes[DEPTH]
     if depth == 0:
         counts[1, i] += 1
         if nodes_meet(
-            words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0],
+            words, base, nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0],
             thresholds[node_class(ints, base, mask)],
         ):  # fmt: skip
             stack[0, 0], stack[0, 1] = 0, base
@@ -203,24 +195,35 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
         depth -= 1
         if leaves:
             block = ~a_first
-            if stamp[block] != i:
-                place_block(avatar, m, block, placed, scene)
-                stamp[block] = i
+            place_block_once(avatar, m, i, block, placed, scene)
             _gather_leaves(
-                avatar, m, a, block, placed, scene, voxel, row, options, edges[i], state, scratch, i, results
+                avatar,
+                m,
+                a,
+                block,
+                scene,
+                voxel,
+                location,
+                row,
+                options,
+                edges[i],
+                state,
+                scratch,
+                i,
+                results,
             )
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             counts[1, i] += held[a]
             threshold = thresholds[node_class(ints, row, mask)]
             for child in range(a_first, a_first + held[a]):
                 if nodes_meet(
-                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
+                    words, row, nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z,
                     nodes[3, child], threshold,
                 ):  # fmt: skip
                     stack[depth, 0], stack[depth, 1] = child, row
                     depth += 1
         else:
-            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
+            x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
             counts[1, i] += ints[row + COUNT] & COUNTED
             for child in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + child) * ROW_WORDS
@@ -229,18 +232,6 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     sizes[DEPTH] = depth
-
-
-@njit_no_refcount
-def _set_thresholds(units, extent, farthest, scene, scratch):
-    """Fill scratch.error and scratch.by_class for one pose.
-
-    units: reach of the largest sphere.  extent, farthest: of `place_nodes`.
-    """
-    per_step, steps = scene.units_per_step, scene.voxel_steps
-    # No class has a larger error.
-    scratch.error[0] = make_thresholds(units, per_step, extent, farthest, steps).error
-    set_class_thresholds(scratch.by_class, scene.radius_deficit, units, per_step, extent, farthest, steps)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -254,11 +245,10 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
     `options.cells` and has no space for LANES more; and if the lists are longer than `options.listed`.
     Call again with the returned state, from the same pose on. Adds to `results`.
     """
-    placed = make_placed(avatar)
     scratch = ContactScratch(
-        np.empty(LANES, np.bool_), np.empty((3, LANES), np.float32), np.empty(LANES, np.float32),
-        np.empty(3, np.float32), np.empty(1), np.empty(1), np.empty((1, RECORD), np.int64),
-        make_class_thresholds(scene.radius_deficit),
+        make_placed(avatar), make_class_thresholds(scene.radius_deficit), np.empty(LANES, np.bool_),
+        np.empty((3, LANES), np.float32), np.empty(LANES, np.float32), np.empty(1), np.empty(1),
+        np.empty((1, RECORD), np.int64),
     )  # fmt: skip
     rows = reach.lists.rows
     for number in range(which.shape[0]):
@@ -267,8 +257,8 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
         if stopped(scene.stop) or state_of(held, rows[cursor[i]]) == NOT_HELD:
             return state
         state.sizes[POSE] = i
-        extent, farthest = place_nodes(avatar, poses[i], placed, scene)
-        _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
+        extent, farthest = place_nodes(avatar, poses[i], scratch.placed, scene)
+        scratch.error[0] = set_class_thresholds(scratch.by_class, scene, reach.units[i], extent, farthest)
         scratch.bound[0] = listing_bound(
             state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]
         )
@@ -287,10 +277,10 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
                 # Here and not in the descent: a loop that changes a tuple of arrays counts
                 # their references in every iteration, which took a third of the time.
                 state = ContactState(
-                    grow_cells(state.cells, state.sizes[CELLS], scene.stop), state.heap, state.sizes, state.stack,
-                    state.pairs, state.clusters,
+                    grow_cells(state.cells, state.sizes[CELLS]), state.heap, state.sizes, state.stack, state.pairs,
+                    state.clusters,
                 )  # fmt: skip
-            _gather_voxel(avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results)
+            _gather_voxel(avatar, poses[i], i, scene, voxel, options, state, scratch, results)
             if state.sizes[DEPTH] == 0:
                 cursor[i] += 1
         if options.edges[i] != BY_SCAN:

@@ -1,4 +1,4 @@
-"""Data that all kernels read: voxel layout, placed avatars, voxels in reach, stop flag.
+"""Data that all kernels read, and what several share: voxel layout, placed avatars, reach, descent.
 
 May import schemas.
 Begin with scene_arrays.py.

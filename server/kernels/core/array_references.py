@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from .placed_avatar import Avatar
-from .reach import VoxelTree
+from .reach import OneReach, VoxelTree, make_one_reach
 from .scene_arrays import SceneArrays
-from .voxels_in_reach import OneReach, make_one_reach
 
 _Fields = TypeVar("_Fields", bound=type)
 

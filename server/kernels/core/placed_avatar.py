@@ -6,8 +6,13 @@ Compiled and interpreted code agree bit for bit.
 
 A placed avatar holds float32 distances in lattice steps from the frame, a lattice point near it.
 Relative to the frame, scene coordinates are integers below 2^24 and therefore exact in float32. The
-placed avatar has a rounding error, which every bound includes (node_overlap.py). Where float32
+placed avatar has a rounding error, which every bound includes (node_bounds.py). Where float32
 cannot decide, the integers do: `pair_square`.
+
+Two pairs compare by their separation, sqrt(D) - R: D is the squared distance of the centres and R
+the sum of the radii, both integers in exact units. Most separations are therefore irrational. Where
+all radii are the same, the squares alone decide. Where they differ, float64 nearly always decides.
+Where it cannot, the roots are eliminated by squaring, and integers of 128 bits are compared.
 
 The *front* is one level of the avatar's tree as a flat list. A descent of two trees tests one pair
 of nodes at a time and branches after each test. Here only the scene's tree is descended. Each of
@@ -20,6 +25,7 @@ negative; it then computes an address for each lane and loads each lane separate
 slower, scripts/bench_engine's `collide`).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +34,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.runtime import compiling as nb
-from .kernel_decorators import njit_no_refcount
+from .kernel_decorators import njit_inlined, njit_no_refcount
 from .scene_arrays import LANES
 
 U = np.uint64
@@ -41,6 +47,13 @@ LIST_CAPACITY = MAX_FRONT * (MAX_LEVELS + 2)
 # Coordinate of the entries that pad a list to whole vector steps. With radius 0, no test keeps a
 # node this far away.
 FAR_AWAY = np.float32(1e30)
+# Two separations whose float64 values differ by more than this are in that order. Squares are below
+# 2^62, so a root is off by at most half of 2^-22 for its rounding and 2^-54 of itself for that of
+# the square: 2.3e-7. Two of them and a sum stay below 6e-7. The last difference is exact where it
+# is small.
+CERTAIN = 2.0**-19
+_LOW = np.uint64(0xFFFFFFFF)
+_HALF = np.uint64(32)
 
 
 class Avatar(NamedTuple):
@@ -132,6 +145,12 @@ def lattice_to_units(steps, units_per_step):
 
 
 @njit_no_refcount
+def _from_frame(world, frame, step):
+    """Return a placed coordinate [m] relative to that of the frame [steps], float32."""
+    return np.float32((world - np.float64(frame) * step) * (1.0 / step))
+
+
+@njit_no_refcount
 def place_root(avatar, m, placed, scene):
     """Choose the frame and place an avatar's root; fill placed.frame, shift and node 0.
 
@@ -144,7 +163,7 @@ def place_root(avatar, m, placed, scene):
         placed.shift[r] = m[r, 3] - scene.origin[r]
         root = place(m, placed.shift, r, x, y, z)
         placed.frame[r] = np.int64(np.rint(root * per_step))
-        placed.nodes[r, 0] = np.float32((root - np.float64(placed.frame[r]) * scene.step) * per_step)
+        placed.nodes[r, 0] = _from_frame(root, placed.frame[r], scene.step)
     placed.nodes[3, 0] = node_reach(avatar.radius[0], per_step, extent)
     return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
 
@@ -256,7 +275,7 @@ def place_lanes(points, m, block, lanes, shift, frame, step):
             lanes[b, r, j] = np.float32((world - base) * per_step)
 
 
-@njit_no_refcount
+@njit_inlined
 def place_block_once(avatar, m, pose, block, placed, scene):
     """Place a block of the avatar unless it is already placed for this pose."""
     if placed.stamp[U(block)] != pose:
@@ -267,18 +286,12 @@ def place_block_once(avatar, m, pose, block, placed, scene):
 @njit_no_refcount
 def place_node(avatar, m, a, placed, scene):
     """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
-    per_step = 1.0 / scene.step
+    shift, frame, step = placed.shift, placed.frame, scene.step
     x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
     return (
-        np.float32(
-            (place(m, placed.shift, 0, x, y, z) - np.float64(placed.frame[0]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 1, x, y, z) - np.float64(placed.frame[1]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 2, x, y, z) - np.float64(placed.frame[2]) * scene.step) * per_step
-        ),
+        _from_frame(place(m, shift, 0, x, y, z), frame[0], step),
+        _from_frame(place(m, shift, 1, x, y, z), frame[1], step),
+        _from_frame(place(m, shift, 2, x, y, z), frame[2], step),
     )
 
 
@@ -296,23 +309,40 @@ def make_placed(avatar):
 
 
 @njit_no_refcount
-def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
+def place_units(points, m, shift, block, lane):
+    """Place the centre of an avatar's point: three int64, exact units."""
+    x, y, z = points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
+    return (
+        to_units(place(m, shift, 0, x, y, z)),
+        to_units(place(m, shift, 1, x, y, z)),
+        to_units(place(m, shift, 2, x, y, z)),
+    )
+
+
+@njit_no_refcount
+def lattice_point(corner, ints, halves, block_at, lane_at, j):
+    """Return the lattice coordinates of a scan point, three int64.
+
+    corner: (3,) int64, of its voxel.  block_at, lane_at, j: see scene_arrays.py.
+    """
+    return (
+        corner[0] + np.int64(ints[block_at]) + np.int64(halves[lane_at + j]),
+        corner[1] + np.int64(ints[block_at + 1]) + np.int64(halves[lane_at + LANES + j]),
+        corner[2] + np.int64(ints[block_at + 2]) + np.int64(halves[lane_at + 2 * LANES + j]),
+    )
+
+
+@njit_no_refcount
+def square_apart(center, point, units_per_step):
     """Compute |a - b|^2 of one pair by the definition (NUMERICS.md N5), int64, exact units.
 
-    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
-    scene_arrays.py.
-    Returns -1 where the points are farther apart along an axis than any reach, MAX_REACH_UNITS;
-    squares therefore fit 63 bits.
+    center: of `place_units`.  point: of `lattice_point`.
+    Returns -1 where they are farther apart along an axis than any reach, MAX_REACH_UNITS; squares
+    therefore fit 63 bits.
     """
     square = np.int64(0)
-    points = avatar.points
     for r in range(3):
-        world = place(
-            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-        )
-        low = scene.corners[voxel, r] + np.int64(scene.ints[block_at + r])
-        steps = low + np.int64(scene.halves[lane_at + r * LANES + j])
-        difference = to_units(world) - lattice_to_units(steps, scene.units_per_step)
+        difference = center[r] - lattice_to_units(point[r], units_per_step)
         if abs(difference) > MAX_REACH_UNITS:
             return np.int64(-1)
         square += difference * difference
@@ -320,7 +350,75 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
 
 
 @njit_no_refcount
+def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
+    """Compute |a - b|^2 of one pair, see `square_apart`.
+
+    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
+    scene_arrays.py.
+    """
+    center = place_units(avatar.points, m, placed.shift, block, lane)
+    point = lattice_point(scene.corners[voxel], scene.ints, scene.halves, block_at, lane_at, j)
+    return square_apart(center, point, scene.units_per_step)
+
+
+@njit_no_refcount
 def pair_in_reach(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, units):
     """Return whether one pair is within `units`, tangency included."""
     square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)
     return square >= 0 and square <= units * units
+
+
+@njit_no_refcount
+def _product(a, b):
+    """Return the product of two uint64 as its high and low 64 bits."""
+    a_high, a_low, b_high, b_low = a >> _HALF, a & _LOW, b >> _HALF, b & _LOW
+    # None of these exceeds 64 bits: (2^32 - 1)^2 + 2 (2^32 - 1) = 2^64 - 1.
+    low = a_low * b_low
+    middle = a_high * b_low + (low >> _HALF)
+    other = a_low * b_high + (middle & _LOW)
+    return a_high * b_high + (middle >> _HALF) + (other >> _HALF), ((other & _LOW) << _HALF) | (low & _LOW)
+
+
+@njit_no_refcount
+def _compare_roots(square, other, radius_difference):
+    """Return the sign of sqrt(square) - (sqrt(other) + d), int64, with d = radius_difference >= 0.
+
+    The two sides differ by at most 1. Squaring both leaves the sign of s - 2 d sqrt(other), with
+    s = square - other - d^2. If s is not negative, both sides are squared again. All terms fit,
+    because d is at most slightly larger than the root of `square`.
+    """
+    s = square - other - radius_difference * radius_difference
+    if s < 0:
+        return -1
+    size, twice = np.uint64(s), np.uint64(2 * radius_difference)
+    high, low = _product(size, size)
+    other_high, other_low = _product(twice * twice, np.uint64(other))
+    if high != other_high:
+        return -1 if high < other_high else 1
+    if low != other_low:
+        return -1 if low < other_low else 1
+    return 0
+
+
+@njit_inlined
+def compare_separations(square, radius, other_square, other_radius):
+    """Compare the separations sqrt(square) - radius of two pairs exactly.
+
+    Returns -1, 0 or 1: the first separation is less than, equal to or greater than the other.
+    square, other_square: int64, 0 to 3 * 2^60, from `pair_square`.  radius, other_radius: int64,
+    -2^31 to 2^31, exact units. Terms common to both radii may be omitted: `-deficit` serves as well
+    as the radius.
+    """
+    radius_difference = radius - other_radius
+    if radius_difference == 0:
+        return 0 if square == other_square else -1 if square < other_square else 1
+    apart = (math.sqrt(np.float64(square)) - math.sqrt(np.float64(other_square))) - np.float64(
+        radius_difference
+    )
+    if apart < -CERTAIN:
+        return -1
+    if apart > CERTAIN:
+        return 1
+    if radius_difference > 0:
+        return _compare_roots(square, other_square, radius_difference)
+    return -_compare_roots(other_square, square, -radius_difference)

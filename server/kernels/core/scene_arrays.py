@@ -5,7 +5,7 @@ takes three runs. It takes a fourth run where the archive keeps scan numbers (`-
 
 - rows: (n, 12) words, one row a node: center x, y, z, radius [voxel steps], the slab's normal x, y,
   z, its length, least and greatest dot(normal, point - center), or a box in their place
-  (node_boxes.py); then two int32: the first child row, or ~block for a leaf node; a word whose low
+  (node_bounds.py); then two int32: the first child row, or ~block for a leaf node; a word whose low
   byte is the number of children or points and whose next byte is the node's radius class. 48 bytes,
   four rows to three cache lines;
 - blocks: (b, 4) int32, one block a leaf node: low corner x, y, z of the box of its points [voxel
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
 from ....schemas.archive.voxel import MAX_LEAF
 from ....schemas.runtime import compiling as nb
-from .kernel_decorators import njit_inlined, njit_no_refcount
+from .kernel_decorators import njit_no_refcount
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant
 # iterations and then does not vectorise them, which costs several times as much a pair.
@@ -53,8 +53,6 @@ COUNTED = 0xFF
 CLASS_SHIFT = 8
 LEAF_CLASS_SHIFT = 13
 LOCAL_MASK = LOCAL_CLASSES - 1
-# Rows copied, sorted or cleared between two checks of the stop flag: some hundred microseconds.
-ROWS_AT_ONCE = 512
 
 
 class Arena(NamedTuple):
@@ -260,19 +258,15 @@ def lay_node_class(nodes: int, own: int, ints: NDArray[np.int32], where: NDArray
 
 
 @nb.intrinsic
-def _load(context, flag):  # type: ignore[no-untyped-def]
-    """Load the first element of an array (1,) int64 atomically."""
+def _stopped(context, flag):  # type: ignore[no-untyped-def]
+    """Load the first element of an array (1,) int64 atomically; return whether it is set."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        return builder.load_atomic(array.data, "monotonic", 8)
+        loaded = builder.load_atomic(array.data, "monotonic", 8)
+        return builder.icmp_signed("!=", loaded, loaded.type(0))
 
-    return nb.types.int64(flag), generate
-
-
-@njit_inlined
-def _stopped(flag):
-    return _load(flag) != 0  # type: ignore[call-arg]  # an intrinsic's first parameter is the compiler's
+    return nb.types.boolean(flag), generate
 
 
 def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
@@ -281,14 +275,3 @@ def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
 
 # stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
 stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
-
-
-@nb.njit(nogil=True, cache=True)
-def copy_rows(rows, to, count, flag):
-    """Copy the first `count` rows of a table; end early once the stop flag is set."""
-    for begin in range(0, count, ROWS_AT_ONCE):
-        if stopped(flag):
-            return
-        for row in range(begin, min(begin + ROWS_AT_ONCE, count)):
-            for c in range(rows.shape[1]):
-                to[row, c] = rows[row, c]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.radius_model import RADIUS_CLASSES
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import STACK
+from ..core.node_bounds import STACK
 from ..core.placed_avatar import Avatar, largest_term, place
 from ..core.scene_arrays import LANES, SceneArrays
 from .screw_motion import ScrewMotion

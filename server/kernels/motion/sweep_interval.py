@@ -44,8 +44,7 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_boxes import has_box
-from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
+from ..core.node_bounds import ONE_SLACK, SLACK, has_box, make_thresholds
 from ..core.reach import HELD, state_of
 from ..core.scene_arrays import (
     COUNT,

@@ -19,9 +19,8 @@ from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import reference
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.reach import all_resident
+from ..core.reach import VALID, all_resident, check_poses
 from ..core.scene_arrays import SceneArrays, stopped
-from ..core.voxels_in_reach import VALID, check_poses
 from .moving_avatar import MovingAvatar, make_moving
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments

@@ -10,7 +10,7 @@ points are placed: their coordinates are relative to the frame or to the block's
 points are whole steps from the low corner of their block.
 
 Float32 separates nearly all pairs of points from the best one. The pairs it cannot separate are
-squared in integers (NUMERICS.md N5) and compared by separation_order.py. The least separation, and
+squared in integers (NUMERICS.md N5) and compared by `compare_separations`. The least separation, and
 the pair that has it, are therefore those of the definition, for every tree and order.
 """
 
@@ -22,11 +22,18 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_boxes import box_square, has_box
-from ..core.node_overlap import ONE_SLACK, SLACK, STACK, U32, make_thresholds
-from ..core.placed_avatar import lattice_to_units, place, to_units
+from ..core.node_bounds import (
+    ONE_SLACK,
+    SLACK,
+    STACK,
+    U32,
+    box_square,
+    has_box,
+    make_thresholds,
+    write_squares,
+)
+from ..core.placed_avatar import compare_separations, lattice_point, place_units, square_apart
 from ..core.scene_arrays import LANES, point_class
-from ..core.separation_order import compare_separations
 
 U = np.uint64  # see placed_avatar.py
 # Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is
@@ -63,16 +70,13 @@ class BestPair(NamedTuple):
     error of a distance [steps]; tolerance as a share of |a - b|, tolerance [exact units]; the
     largest deficit.
     corner: (3,) int64, low corner of the current voxel [steps].
-    keep, squares: (LANES,), a mark and a square for each point of an avatar's block.
-    keep8: the memory of keep as uint64, eight marks each.
+    keep, keep8, counters: of the descent; the last counter is that of candidates.
+    squares: (LANES,) float32, a square for each point of an avatar's block.
     block_squares: (LANES,) float32, a square for each point of a scene block.
     units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + deficit.
-    counters: (3,) int64, node visits, point tests, candidates.
     candidates: (MAX_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
     candidate_squares: (MAX_CANDIDATES,) float32, their least squares there.
-    stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list of front nodes,
-    length.
     below: (STACK,) int64, avatar nodes below its front; keys: (STACK,) float32, their lower bounds.
     off: (3,) float32, from the frame to the voxel's low corner.
     """
@@ -92,25 +96,23 @@ class BestPair(NamedTuple):
     counters: NDArray[np.int64]
     candidates: NDArray[np.int64]
     candidate_squares: NDArray[np.float32]
-    stack: NDArray[np.int64]
     below: NDArray[np.int64]
     keys: NDArray[np.float32]
     off: NDArray[np.float32]
 
 
 @nb.njit(nogil=True, cache=True)
-def make_best_pair(deficit):
+def make_best_pair(deficit, descent):
     """Allocate scratch for as many classes as `deficit` has; no pair is found yet."""
-    keep, n = np.zeros(LANES, np.bool_), deficit.shape[0]
-    frame = np.zeros(8)
+    n, frame = deficit.shape[0], np.zeros(8)
     for c in range(n):
         frame[7] = max(frame[7], np.float64(deficit[c]))
     return BestPair(
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), frame,
-        np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
-        np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MAX_CANDIDATES, 5), np.int64),
-        np.empty(MAX_CANDIDATES, np.float32), np.empty((STACK, 3), np.int64), np.empty(STACK, np.int64),
-        np.empty(STACK, np.float32), np.empty(3, np.float32),
+        np.empty(3, np.int64), descent.keep, descent.keep8, np.empty(LANES, np.float32), np.empty(LANES, np.float32),
+        np.empty(2, np.int64), descent.counters, np.empty((MAX_CANDIDATES, 5), np.int64),
+        np.empty(MAX_CANDIDATES, np.float32), np.empty(STACK, np.int64), np.empty(STACK, np.float32),
+        np.empty(3, np.float32),
     )  # fmt: skip
 
 
@@ -133,23 +135,6 @@ def lower_bound(words, row, x, y, z, radius):
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
     return max(apart - both, gap / words[at + U(7)] - radius) - slack
-
-
-@njit_no_refcount
-def write_squares(halves, lane_at, x, y, z, squares):
-    """Write the squared distances (LANES,) of a scene block's points to a point.
-
-    x, y, z, and the block's points: relative to the block's low corner.
-    """
-    # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
-    # lanes).
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        squares[j] = dx * dx + dy * dy + dz * dz
 
 
 @njit_inlined
@@ -194,9 +179,7 @@ def nearest_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, ke
                 continue
             tested += 1
             x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
-            # The bits of non-negative floats sort like the numbers. The minimum of integers is
-            # vectorised; that of floats is not, because LLVM must allow for a NaN.
-            least = np.int32(0x7F800000)
+            least = np.int32(0x7F800000)  # infinity, see `write_squares`
             for j in range(LANES):
                 i = h + U(j)
                 dx = np.float32(halves[i]) - x
@@ -282,45 +265,21 @@ def _update_best(
     Ties go to the lesser scan point, then to the lesser avatar centre.
     points, shift: of Avatar and PlacedAvatar.  corner: (3,) int64, of the voxel [steps].  deficit:
     of the scan point's class.
-    The square is that of `pair_square`.
     """
-    square = np.int64(0)
     units -= deficit
-    for r in range(3):
-        world = place(m, shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
-        steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        difference = to_units(world) - lattice_to_units(steps, units_per_step)
-        if abs(difference) > units:
-            return
-        square += difference * difference
-    if square > units * units:
+    center = place_units(points, m, shift, block, lane)
+    point = lattice_point(corner, ints, halves, block_at, lane_at, j)
+    square = square_apart(center, point, units_per_step)
+    if square < 0 or square > units * units:
         return
-    lesser = found[0] < 0
-    if not lesser:
-        if deficit == found[7]:
-            if square > found[0]:
-                return
-            lesser = square < found[0]
-        else:
-            order = compare_separations(square, -deficit, found[0], -found[7])
-            if order > 0:
-                return
-            lesser = order < 0
-    for r in range(6):
-        if r < 3:
-            value = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        else:
-            world = place(
-                m, shift, r - 3, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-            )
-            value = to_units(world)
-        if not lesser:
-            if value > found[1 + r]:
-                return
-            lesser = value < found[1 + r]
-        # While all earlier values are equal, this writes the value already stored.
-        found[1 + r] = value
+    if found[0] >= 0:
+        order = compare_separations(square, -deficit, found[0], -found[7])
+        known = (found[1], found[2], found[3], found[4], found[5], found[6])
+        if order > 0 or (order == 0 and point + center >= known):
+            return
     found[0], found[7] = square, deficit
+    for r in range(3):
+        found[1 + r], found[4 + r] = point[r], center[r]
 
 
 @njit_no_refcount

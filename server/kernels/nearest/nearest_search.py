@@ -1,10 +1,9 @@
 """Nearest pair of two bounding sphere hierarchies under a pose, after [Fig12] figures 5 and 6.
 
-This is branch and bound, with the best pair so far as the bound. The scene's tree is descended with
-a list of those nodes of the avatar's front that may hold a nearer pair, as in collide_poses.py,
-where the reach is the bound. A node is pruned only if its lower bound, minus the largest float32
-error, exceeds the best; the radius class of the largest sphere below a node sets its bound.
-nearest_pair.py defines nearest and handles the points.
+This is branch and bound, with the best pair so far as the bound. The descent is that of
+front_descent.py. A node is pruned only if its lower bound, minus the largest float32 error, exceeds
+the best; the radius class of the largest sphere below a node sets its bound. nearest_pair.py defines
+nearest and handles the points.
 
 The first bound is narrow and is widened while nothing is found within it. Two alternatives are
 slower. A single descent of both trees, taking the nearest child each time, gives a poor first
@@ -14,47 +13,22 @@ visiting them in stored order (scripts/bench_engine, distance on the walk).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
+from ..core.front_descent import GO_ON, Descent, descend_voxel, make_descent
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_overlap import (
-    BROAD,
-    FLAT,
-    U32,
-    compact_marked,
-    copy_node,
-    lanes_meet,
-    mark_meeting,
-    nodes_meet,
-)
-from ..core.placed_avatar import (
-    lattice_to_units,
-    make_front,
-    make_placed,
-    node_reach,
-    pad_list,
-    place,
-    place_front,
-    place_lanes,
-    place_root,
-)
-from ..core.reach import HELD, NOT_HELD, resident_front, state_of
-from ..core.scene_arrays import (
-    COUNT,
-    COUNTED,
-    FIRST,
-    LANES,
-    ROW_WORDS,
-    leaf_class,
-    node_class,
-    stopped,
-)
-from ..core.voxels_in_reach import VALID, find_reach
+from ..core.node_bounds import U32, lanes_meet, locate_block, locate_voxel, nodes_meet
+from ..core.placed_avatar import lattice_to_units, place_block_once, place_front, place_nodes, place_root
+from ..core.reach import HELD, NOT_HELD, VALID, find_reach, resident_front, state_of
+from ..core.scene_arrays import LANES, leaf_class, node_class, stopped
 from .nearest_pair import (
+    BestPair,
     NearestPairs,
     found_units,
     lower_bound,
@@ -74,40 +48,28 @@ U = np.uint64  # see placed_avatar.py
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
 
 
-@njit_no_refcount
-def place_all(avatar, m, placed, scene, bounds):
-    """Place an avatar: root and nodes below its front into placed.nodes, the front in `bounds`.
+class _SearchScratch(NamedTuple):
+    """Scratch of one call.
 
-    The front becomes the first list of `bounds`. Fills placed.frame and shift. Returns (extent,
-    farthest) for `make_thresholds` and the length of the list.
+    best: the pair found.
+    gaps: for each voxel of the pose's list, its `near`; inf: missing.  classes: of their largest
+    spheres.
     """
-    extent, farthest = place_root(avatar, m, placed, scene)
-    count = place_front(avatar, m, placed, scene, extent, bounds)
-    if avatar.first[avatar.front_first] < 0:
-        return extent, farthest, count  # only points are below
-    center, radius, nodes, shift = avatar.center, avatar.radius, placed.nodes, placed.shift
-    per_step = 1.0 / scene.step
-    for a in range(avatar.front_first, center.shape[0]):
-        for r in range(3):
-            world = place(m, shift, r, center[a, 0], center[a, 1], center[a, 2])
-            nodes[r, a] = np.float32((world - np.float64(placed.frame[r]) * scene.step) * per_step)
-        nodes[3, a] = node_reach(radius[a], per_step, extent)
-    return extent, farthest, count
+
+    descent: Descent
+    best: BestPair
+    gaps: NDArray[np.float64]
+    classes: NDArray[np.uint64]
 
 
 @njit_inlined
-def _search_leaves(m, a, row, avatar, placed, scene, location, best):
+def _search_leaves(avatar, m, a, scene, voxel, location, row, scratch):
     """Update the best pair from an avatar's leaf node (its marked points) and a scene's."""
+    placed, best = scratch.descent.placed, scratch.best
     ints, lanes, keep, block = scene.ints, placed.lanes, best.keep, ~np.int64(avatar.first[U(a)])
-    off = best.off
     for lane in range(avatar.count[U(a)], LANES):
         keep[U(lane)] = False  # repeats the last point
-    number = ~np.int64(ints[U(row + FIRST)])
-    block_at = location[1] + number * scene.block_words
-    lane_at = location[2] + number * 3 * LANES
-    low_x = off[0] + np.float32(ints[U(block_at)])
-    low_y = off[1] + np.float32(ints[U(block_at + 1)])
-    low_z = off[2] + np.float32(ints[U(block_at + 2)])
+    block_at, lane_at, low_x, low_y, low_z = locate_block(ints, location, row, scene.block_words)
     halves, c = scene.halves, leaf_class(ints, row, best.mask)
     unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
     least, tested = nearest_squares(
@@ -118,6 +80,7 @@ def _search_leaves(m, a, row, avatar, placed, scene, location, best):
         take_candidates(
             least, c, block, block_at, lane_at, best, avatar.points, m, placed.shift, ints, scene.halves, lanes
         )  # fmt: skip
+    return GO_ON
 
 
 @njit_no_refcount
@@ -131,13 +94,14 @@ def _push(below, keys, begin, depth, a, key):
 
 
 @njit_no_refcount
-def _search_below(avatar, m, pose, a, row, placed, scene, location, best):
+def _search_below(avatar, m, extent, pose, scene, voxel, location, a, row, scratch):
     """Search a scene leaf node for a point nearer to a point below a node of the avatar's front.
 
     The avatar's node is descended depth first, the nearest child first. This is for avatars whose
     front is not their leaf nodes.
     """
-    words, nodes, firsts, held = scene.words, placed.nodes, avatar.first, avatar.count
+    placed, best, words = scratch.descent.placed, scratch.best, scene.words
+    nodes, firsts, held = placed.nodes, avatar.first, avatar.count
     below, keys, off, cut = best.below, best.keys, best.off, best.cut
     of_class = node_class(scene.ints, row, best.mask)
     below[0], keys[0] = a, np.float32(-1.0)
@@ -150,11 +114,9 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best):
         a_first = np.int64(firsts[a])
         if a_first < 0:
             block = ~a_first
-            if placed.stamp[block] != pose:
-                place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
-                placed.stamp[block] = pose
+            place_block_once(avatar, m, pose, block, placed, scene)
             if lanes_meet(words, row, placed.lanes, block, off[0], off[1], off[2], within, best.keep):
-                _search_leaves(m, a, row, avatar, placed, scene, location, best)
+                _search_leaves(avatar, m, a, scene, voxel, location, row, scratch)
             continue
         begin = depth
         best.counters[0] += held[a]
@@ -166,84 +128,35 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best):
             if key <= within:
                 _push(below, keys, begin, depth, child, key)
                 depth += 1
+    return GO_ON
+
+
+@njit_inlined
+def _pass_flat(scene, location, row, at, block, threshold, scratch):
+    """Let the descent go on below a flat node: a tolerance only narrows the cut."""
+    return GO_ON
 
 
 @njit_no_refcount
-def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, best):
-    """Search one resident voxel for a nearer pair; return `_least_left`.
-
-    The descent is that of collide_poses.py, and the function is long for the same reason.
-    """
-    words, ints = scene.words, scene.ints
-    nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
-    cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, best.off
-    bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
-    firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
-    stack, mask = best.stack, best.mask
-    shift, frame, step, stop = placed.shift, placed.frame, scene.step, scene.stop
-    location = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
+def _nearest_voxel(avatar, m, extent, pose, scene, voxel, count, scratch):
+    """Search one resident voxel for a nearer pair; return `_least_left`."""
+    words, best, descent = scene.words, scratch.best, scratch.descent
+    placed, nodes, cut, off = descent.placed, descent.placed.nodes, best.cut, best.off
+    location = locate_voxel(scene, voxel, placed)
+    off[0], off[1], off[2] = location.x, location.y, location.z
     for r in range(3):
-        corner[r] = scene.corners[voxel, r]
-        off[r] = np.float32(corner[r] - placed.frame[r])
-    off_x, off_y, off_z = off[0], off[1], off[2]
-    counters[0] += 1
-    x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
-    broad = BROAD * radius
-    if not nodes_meet(words, location[0], x, y, z, radius, cut[node_class(ints, location[0], mask)]):
+        best.corner[r] = scene.corners[voxel, r]
+    descent.counters[0] += 1
+    x, y, z = nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2]
+    threshold = cut[node_class(scene.ints, location.rows, best.mask)]
+    if not nodes_meet(words, location.rows, x, y, z, nodes[3, 0], threshold):
         return np.inf
-    stack[0, 0], stack[0, 1], stack[0, 2] = location[0], 0, count
-    depth, cut_short = 1, False
-    while depth > 0 and not stopped(stop):
-        depth -= 1
-        row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
-        first = np.int64(ints[U(row + FIRST)])
-        c = node_class(ints, row, mask)
-        if first < 0 or words[U(row + 3)] < broad:
-            counters[0] += count
-            steps = (count + LANES - 1) // LANES
-            if not mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, cut[c], listed):
-                continue
-            to = at + steps * LANES
-            count = compact_marked(bounds, which, listed, listed8, at, steps, to)
-            at = to
-            thick = words[U(row + 9)] - words[U(row + 8)]
-            if first < 0 or thick < FLAT * abs(words[U(row + 7)]) * bounds[3, U(at)]:
-                left = at
-                for i in range(at, at + count):
-                    a = front_first + np.int64(which[U(i)])
-                    a_first = np.int64(firsts[U(a)])
-                    if a_first < 0:
-                        block = ~a_first
-                        if stamp[U(block)] != pose:
-                            place_lanes(points, m, block, lanes, shift, frame, step)
-                            stamp[U(block)] = pose
-                        counters[0] += 1
-                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, cut[c], keep):
-                            continue
-                        if first < 0:
-                            _search_leaves(m, a, row, avatar, placed, scene, location, best)
-                            continue
-                    elif first < 0:
-                        _search_below(avatar, m, pose, a, row, placed, scene, location, best)
-                        cut_short = stopped(stop)
-                        continue
-                    copy_node(bounds, which, U(i), U(left))
-                    left += 1
-                if left == at:  # always true at a leaf
-                    continue
-                pad_list(bounds, left, at + (count + LANES - 1) // LANES * LANES)
-                count = left - at
-        children = np.int64(ints[U(row + COUNT)] & COUNTED)
-        child = location[0] + first * ROW_WORDS
-        counters[0] += children
-        for _ in range(children):
-            stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
-            if nodes_meet(words, child, x, y, z, radius, cut[node_class(ints, child, mask)]):
-                depth += 1
-            child += ROW_WORDS
-    settle_candidates(best, points, m, placed.shift, ints, scene.halves, lanes)
-    # The last node taken from the stack is still there, and may be searched only in part.
-    return _least_left(words, bounds, stack, depth + 1 if cut_short else depth, off, best.frame[4])
+    _, entries = descend_voxel(
+        avatar, m, extent, pose, scene, voxel, location, count, scratch, cut, best.mask, False, _pass_flat,
+        _search_leaves, _search_below,
+    )  # fmt: skip
+    settle_candidates(best, avatar.points, m, placed.shift, scene.ints, scene.halves, placed.lanes)
+    return _least_left(words, descent.front.bounds, descent.stack, entries, off, best.frame[4])
 
 
 @njit_no_refcount
@@ -262,16 +175,14 @@ def _least_left(words, bounds, stack, entries, off, error):
 
 
 @njit_no_refcount
-def _search_widening(
-    m, pose, avatar, placed, scene, rows, beyond, first, last, front, count, best, gaps, classes
-):
+def _search_widening(avatar, m, extent, pose, scene, rows, beyond, first, last, count, scratch):
     """Search the voxels rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
     nodes are far. Returns a lower bound of |a - b| + deficit of what was not searched because of
     the stop flag [steps]; inf: nothing.
-    gaps: for each voxel, its `near`; inf: missing.  classes: of their largest spheres.
     """
+    best, gaps, classes = scratch.best, scratch.gaps, scratch.classes
     units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
     # Under the radius model, no sphere here is larger than the largest minus this.
     base = deficit[classes[0]]
@@ -299,7 +210,7 @@ def _search_widening(
             left = least
             if not stopped(scene.stop):
                 gaps[at] = -1.0 - least
-                left = _nearest_voxel(avatar, m, pose, placed, scene, rows[first + at], front, count, best)
+                left = _nearest_voxel(avatar, m, extent, pose, scene, rows[first + at], count, scratch)
             if left < np.inf:
                 for other in range(last - first):
                     if gaps[other] >= 0.0:
@@ -338,17 +249,14 @@ def nearest_poses(
     whose initial values are -1, inf and 0. Once the scene's stop flag is set, `missing_bound` of the
     pose in hand bounds what was not searched, and the poses after it are not finished.
     """
-    placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
+    descent, most = make_descent(avatar), 0
+    best = make_best_pair(scene.radius_deficit, descent)
     best.frame[5], best.frame[6] = share, tolerance
-    front = make_front(avatar)
-    most = 0
     for number in range(which.shape[0]):
         i = which[number]
         most = max(most, reach.lists.starts[i + 1] - cursor[i])
-    gaps, classes = np.empty(most), np.empty(most, np.uint64)
-    _nearest_poses(
-        poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, gaps, classes,
-    )  # fmt: skip
+    scratch = _SearchScratch(descent, best, np.empty(most), np.empty(most, np.uint64))
+    _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch)
 
 
 @njit_no_refcount
@@ -359,10 +267,9 @@ def nothing_nearer(nearest, i, near, scene):
 
 
 @njit_no_refcount
-def _nearest_poses(
-    poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, gaps, classes,
-):  # fmt: skip
+def _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch):
     """Implement `nearest_poses` with its scratch passed in."""
+    placed, best, gaps, classes = scratch.descent.placed, scratch.best, scratch.gaps, scratch.classes
     rows, near = reach.lists.rows, reach.lists.near
     for number in range(which.shape[0]):
         i = which[number]
@@ -382,7 +289,12 @@ def _nearest_poses(
             continue
         if stopped(scene.stop):
             return
-        best.frame[0], best.frame[1], count = place_all(avatar, poses[i], placed, scene, front.bounds)
+        m = poses[i]
+        extent, farthest = place_root(avatar, m, placed, scene)
+        if avatar.first[avatar.front_first] >= 0:  # there are nodes below the front
+            place_nodes(avatar, m, placed, scene)
+        count = place_front(avatar, m, placed, scene, extent, scratch.descent.front.bounds)
+        best.frame[0], best.frame[1] = extent, farthest
         best.units[0], best.units[1] = reach.units[i], reach.units[i]
         best.found[0] = nearest.square[i]
         for r in range(6):
@@ -390,9 +302,7 @@ def _nearest_poses(
         best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        left = _search_widening(
-            poses[i], i, avatar, placed, scene, rows, beyond, first, last, front, count, best, gaps, classes
-        )  # fmt: skip
+        left = _search_widening(avatar, m, extent, i, scene, rows, beyond, first, last, count, scratch)
         nearest.missing_bound[i] = min(nearest.missing_bound[i], left, unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):

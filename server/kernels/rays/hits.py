@@ -38,8 +38,7 @@ from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.runtime import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_boxes import enter_box, has_box
-from ..core.node_overlap import U32
+from ..core.node_bounds import U32, enter_box, has_box, write_squares
 from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
 from ..core.reach import MISSING, NOT_HELD, REACH_STACK, all_resident, list_item, state_of
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
@@ -114,9 +113,8 @@ def first_meeting(dx, dy, dz, ux, uy, uz, radius):
 
     dx, dy, dz, radius: int64 units.
     """
-    inside = (
-        abs(dx) <= radius and abs(dy) <= radius and abs(dz) <= radius
-    )  # otherwise squares might not fit 63 bits
+    # Otherwise squares might not fit 63 bits.
+    inside = abs(dx) <= radius and abs(dy) <= radius and abs(dz) <= radius
     if inside and dx * dx + dy * dy + dz * dz <= radius * radius:
         return 0.0
     x, y, z, r = np.float64(dx), np.float64(dy), np.float64(dz), np.float64(radius)
@@ -153,15 +151,12 @@ def meet_node(words, row, ray, radius, limit):
     first = max(first, 0.0)
     if has_box(words, row):
         return enter_box(words, row, ray, radius, first, min(last, limit))
-    nx, ny, nz = (
-        np.float64(words[U(row) + U(4)]),
-        np.float64(words[U(row) + U(5)]),
-        np.float64(words[U(row) + U(6)]),
-    )
+    w = U(row)
+    nx, ny, nz = np.float64(words[w + U(4)]), np.float64(words[w + U(5)]), np.float64(words[w + U(6)])
     slope = nx * ray[3] + ny * ray[4] + nz * ray[5]
     offset = nx * dx + ny * dy + nz * dz
-    wide = words[U(row) + U(7)] * radius
-    least, most = words[U(row) + U(8)] - wide, words[U(row) + U(9)] + wide
+    wide = words[w + U(7)] * radius
+    least, most = words[w + U(8)] - wide, words[w + U(9)] + wide
     begin, end = first * slope - offset, last * slope - offset
     if (begin > most and end > most) or (begin < least and end < least):
         return np.inf
@@ -182,15 +177,11 @@ def _below_node(words, row, x, y, z, limit):
     therefore in the round disc that contains both. Rounding: less than 2^-24 of the distance to the
     centre, where the root of a small difference magnifies it.
     """
-    dx, dy, dz = x - words[U(row)], y - words[U(row) + U(1)], z - words[U(row) + U(2)]
-    nx, ny, nz = (
-        np.float64(words[U(row) + U(4)]),
-        np.float64(words[U(row) + U(5)]),
-        np.float64(words[U(row) + U(6)]),
-    )
+    w = U(row)
+    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
+    nx, ny, nz = np.float64(words[w + U(4)]), np.float64(words[w + U(5)]), np.float64(words[w + U(6)])
     square = dx * dx + dy * dy + dz * dz
-    radius = np.float64(words[U(row) + U(3)])
-    length = np.float64(words[U(row) + U(7)])
+    radius, length = np.float64(words[w + U(3)]), np.float64(words[w + U(7)])
     middle = math.sqrt(square)
     slack = middle * 2.0**-24
     below: float = middle - radius
@@ -202,7 +193,7 @@ def _below_node(words, row, x, y, z, limit):
         along = (nx * dx + ny * dy + nz * dz) * inverse
         # The length is rounded up; offsets divided by it are too short by at most 2^-23, which the
         # slack covers.
-        gap: float = max(along - words[U(row) + U(9)] * inverse, words[U(row) + U(8)] * inverse - along, 0.0)
+        gap: float = max(along - words[w + U(9)] * inverse, words[w + U(8)] * inverse - along, 0.0)
         gap = gap - (abs(along) + radius) * 2.0**-21
         if gap > 0.0:
             across: float = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
@@ -215,9 +206,8 @@ def _below_node(words, row, x, y, z, limit):
 def _squares_across(halves, lane_at, qx, qy, qz, ray, squares):
     """Write the squared distances (LANES,) of a block's points from a ray, and return the least.
 
-    q: a point of the ray, relative to the block's corner.
+    q: a point of the ray, relative to the block's corner. Otherwise as `write_squares`.
     """
-    # Unsigned: numba does not vectorise an index that may be negative.
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     ax, ay, az = np.float32(ray[6]), np.float32(ray[7]), np.float32(ray[8])
@@ -230,24 +220,6 @@ def _squares_across(halves, lane_at, qx, qy, qz, ray, squares):
         z = np.float32(halves[at_z + j]) - qz
         a, b = x * ax + y * ay + z * az, x * bx + y * by + z * bz
         square = np.float32(a * a + b * b)
-        squares[j] = square
-        # As in `nearest_squares`.
-        least = min(least, square.view(np.int32))
-    return np.int32(least).view(np.float32)
-
-
-@njit_no_refcount
-def _squares_between(halves, lane_at, qx, qy, qz, squares):
-    """Write the squared distances (LANES,) of a block's points from a point, and return the least."""
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    least = np.int32(0x7F800000)
-    for lane in range(LANES):
-        j = U(lane)
-        x = np.float32(halves[at_x + j]) - qx
-        y = np.float32(halves[at_y + j]) - qy
-        z = np.float32(halves[at_z + j]) - qz
-        square = np.float32(x * x + y * y + z * z)
         squares[j] = square
         least = min(least, square.view(np.int32))
     return np.int32(least).view(np.float32)
@@ -286,7 +258,7 @@ def _test_block(scene, voxel, row, batch, i, error, best, scratch):
         span = min(best.value[i], np.float64(batch.reach)) / per_step + error
         span += 16.0 * U32 * (span + 4.0 * radius + 1.0)
         qx, qy, qz = np.float32(line[0] - low_x), np.float32(line[1] - low_y), np.float32(line[2] - low_z)
-        least = _squares_between(halves, lane_at, qx, qy, qz, squares)
+        least = write_squares(halves, lane_at, qx, qy, qz, squares)
         # No point beyond the least by more than twice the rounding can be nearest.
         nearest = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32)
         nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * radius + 1.0)
@@ -322,19 +294,10 @@ def _test_block(scene, voxel, row, batch, i, error, best, scratch):
             nearer = square < limit or best.square[i] < 0
             best.square[i] = limit = square
             value = math.sqrt(np.float64(square))
-        if nearer or _is_less(sx, sy, sz, best.lattice[i]):
+        lattice = best.lattice
+        if nearer or (sx, sy, sz) < (lattice[i, 0], lattice[i, 1], lattice[i, 2]):
             best.value[i] = value
-            best.lattice[i, 0], best.lattice[i, 1], best.lattice[i, 2] = sx, sy, sz
-
-
-@njit_no_refcount
-def _is_less(x, y, z, other):
-    """Return whether a lattice point precedes another (3,), by x, then y, then z."""
-    if x != other[0]:
-        return x < other[0]
-    if y != other[1]:
-        return y < other[1]
-    return z < other[2]
+            lattice[i, 0], lattice[i, 1], lattice[i, 2] = sx, sy, sz
 
 
 @njit_no_refcount
@@ -402,12 +365,9 @@ def _search_voxel(scene, voxel, batch, i, near, best, scratch):
             if bound <= limit:
                 place = depth
                 while place > begin and keys[place - 1] < key:
-                    rows[place], bounds[place], keys[place] = (
-                        rows[place - 1],
-                        bounds[place - 1],
-                        keys[place - 1],
-                    )
-                    place -= 1
+                    above_it = place - 1
+                    rows[place], bounds[place], keys[place] = rows[above_it], bounds[above_it], keys[above_it]
+                    place = above_it
                 rows[place], bounds[place], keys[place] = row, bound, key
                 depth += 1
         count = np.int64(0)

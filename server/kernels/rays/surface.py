@@ -10,7 +10,7 @@ import numpy as np
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_boxes import box_square, has_box
+from ..core.node_bounds import box_square, has_box
 from ..core.normal_codes import add_sums
 from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
@@ -91,9 +91,6 @@ def add_near(held, voxels, x, y, z, square, sums, directions, heights):
     """
     scene, rows = held.scene, np.empty(STACK, np.int64)
     for voxel in voxels:
-        u, v, w = (
-            x - scene.corners[voxel, 0],
-            y - scene.corners[voxel, 1],
-            z - scene.corners[voxel, 2],
-        )
+        corner = scene.corners[voxel]
+        u, v, w = x - corner[0], y - corner[1], z - corner[2]
         _add_near(scene, voxel, u, v, w, square, rows, sums, directions, heights)

@@ -8,7 +8,7 @@ import numpy as np
 from ....schemas.runtime import compiling as nb
 from ..bodies.body_pairs import find_near_bodies
 from ..collide.collide_poses import collide_resident
-from ..core.voxels_in_reach import VALID
+from ..core.reach import VALID
 from ..motion.sweep_resident import MAX_UNDECIDED, OPEN, PROVED, longest_way, pose_between, sweep_resident
 from ..rays.hits import nearest_in_memory
 from .state import (

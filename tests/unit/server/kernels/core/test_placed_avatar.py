@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core import node_overlap
+from solidcloud.server.kernels.core import node_bounds
 from solidcloud.server.kernels.core import placed_avatar as kernel
 from solidcloud.server.kernels.core.scene_arrays import LANES
 
@@ -150,7 +150,7 @@ def test_thresholds_are_outside_the_errors_documented_and_not_far(
 ) -> None:
     """Each term of the docstring weighs in one of the cases; thresholds lie beyond it by less than float32 tells."""
     units = round(reach * UNITS_PER_STEP)
-    found = node_overlap.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
+    found = node_bounds.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
     error = 1.1 / UNITS_PER_STEP
     error += U32 * (extent + 2 * (max(65_536, voxel_steps) + reach)) + farthest * 2.0**-49
     around = math.sqrt(3) * error

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core import placed_avatar as placing
-from solidcloud.server.kernels.core import voxels_in_reach as pose_checks
+from solidcloud.server.kernels.core import reach as pose_checks
 from solidcloud.server.kernels.core.scene_arrays import BLOCK_WORDS, SceneArrays
 
 pytestmark = pytest.mark.interpreted

@@ -6,7 +6,7 @@ import archive_cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core import voxels_in_reach as pose_checks
+from solidcloud.server.kernels.core import reach as pose_checks
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted

@@ -5,7 +5,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.core.separation_order import CERTAIN, compare_separations
+from solidcloud.server.kernels.core.placed_avatar import CERTAIN, compare_separations
 
 pytestmark = pytest.mark.interpreted
 

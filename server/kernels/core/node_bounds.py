@@ -1,8 +1,25 @@
-"""Overlap of a placed avatar with a node of the scene's tree: thresholds of a pose, and the tests.
+"""Bounds of a node of the scene's tree, and their overlap with a placed avatar.
 
 A test compares float32 distances with a threshold that includes all errors: a node that holds a
 point in reach always passes. Pairs of points below `near` touch, pairs above `far` do not; pairs
 between them need integers (`pair_in_reach`).
+
+A node is bounded by its sphere, and by its slab or its box if that is tighter. A slab bounds a flat
+patch of any direction, but only across it. A box bounds a node on all sides, but only parallel to
+the axes. Which one is tighter depends on the node, so each node has the one that leaves less room
+around its points. On the façade, whose walls are parallel to the axes, nine of ten nodes have a box;
+turned by 30 degrees about the vertical, seven; tilted as well, one (scripts/bench_engine --only
+boxes).
+
+Boxes are computed when a voxel is loaded, from the points themselves, so every archive has them and
+no archive can state them wrongly. A row that has a box holds, in place of the slab:
+
+- the centre of the box, and the radius of a sphere around that centre;
+- in the words of the slab's normal, half the edges of the box;
+- -1 as the length of that normal, which marks the box; a length is positive otherwise;
+- in the words of the slab's offsets, minus and plus half the shortest edge.
+
+All are exact in float32, except the radius, which is rounded up: edges are below 2^21 steps.
 """
 
 import math
@@ -14,9 +31,8 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.runtime import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
-from .node_boxes import box_square, has_box
 from .placed_avatar import pad_list
-from .scene_arrays import LANES
+from .scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 
 U = np.uint64  # see placed_avatar.py
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
@@ -33,6 +49,10 @@ FLAT = np.float32(1.0)
 # A scene node of more than this many radii of the avatar's root is tested against the root only,
 # because most of the front's nodes would meet it.
 BROAD = np.float32(2.0)
+# Bounds are compared by the room within this distance of them [m], about the radius of an avatar's
+# leaf node. Other values were not tried.
+ROOM = 0.02
+ZERO = np.float32(0.0)
 
 
 class Thresholds(NamedTuple):
@@ -88,14 +108,16 @@ def make_class_thresholds(deficit):
 
 
 @njit_no_refcount
-def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farthest, voxel_steps):
+def set_class_thresholds(by_class, scene, units, extent, farthest):
     """Compute the thresholds of one pose for each radius class.
 
-    Arguments as for `make_thresholds`; `units` is for the largest radius. Returns its error.
+    Arguments as for `make_thresholds`; `units` is for the largest radius. Returns the largest error.
     """
     error = np.float32(0.0)
-    for c in range(deficit.shape[0]):
-        thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
+    for c in range(scene.radius_deficit.shape[0]):
+        thresholds = make_thresholds(
+            units - scene.radius_deficit[c], scene.units_per_step, extent, farthest, scene.voxel_steps
+        )
         by_class.threshold[c] = thresholds.reach + thresholds.error
         by_class.near[c], by_class.far[c] = thresholds.near, thresholds.far
         by_class.units[c] = thresholds.units
@@ -138,6 +160,46 @@ def make_thresholds(units, units_per_step, extent, farthest, voxel_steps):
         np.nextafter(far, np.float32(np.inf)),
         np.int64(units),
     )
+
+
+@njit_inlined
+def has_box(words, row):
+    """Return whether a row is bounded by a box instead of a slab."""
+    return words[U(row) + U(7)] < ZERO
+
+
+@njit_inlined
+def box_square(words, row, dx, dy, dz):
+    """Return the squared distance [steps^2] of a position from a node's box, 0 inside.
+
+    dx, dy, dz: position relative to the centre of the row.
+    """
+    w = U(row)
+    ex = max(abs(dx) - words[w + U(4)], ZERO)
+    ey = max(abs(dy) - words[w + U(5)], ZERO)
+    ez = max(abs(dz) - words[w + U(6)], ZERO)
+    return ex * ex + ey * ey + ez * ez
+
+
+@njit_no_refcount
+def enter_box(words, row, ray, radius, first, last):
+    """Return where a ray enters the box of a row, inflated by `radius`, in [first, last]; inf if nowhere.
+
+    ray: as in `meet_node` of kernels/rays/hits.py. All distances in steps, float64.
+    """
+    for k in range(3):
+        slope, off = ray[3 + k], np.float64(words[row + k]) - ray[k]
+        wide = np.float64(words[row + 4 + k]) + radius
+        if slope == 0.0:
+            if abs(off) > wide:
+                return np.inf
+            continue
+        # Where the ray enters and leaves the two sides; both rounded outwards.
+        begin, end = (off - wide) / slope, (off + wide) / slope
+        slack = (abs(begin) + abs(end)) * 2.0**-50
+        first = max(first, min(begin, end) - slack)
+        last = min(last, max(begin, end) + slack)
+    return first if first <= last else np.inf
 
 
 @njit_no_refcount
@@ -322,21 +384,43 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 
 
 @njit_no_refcount
-def sphere_is_near(halves, lane_at, low_x, low_y, low_z, x, y, z, reach):
-    """Return whether a point of a scene block may be within `reach` of a place.
+def write_squares(halves, lane_at, x, y, z, squares):
+    """Write the squared distances (LANES,) of a block's points from a place; return the least.
 
-    lane_at, low: as for `next_near`.  x, y, z: from the frame [steps].  reach: includes their
-    error.
+    x, y, z: float32, relative to the block's low corner, as the points are.
     """
-    h, near, square = U(lane_at), False, reach * reach * ONE_SLACK
-    x, y, z = x - low_x, y - low_y, z - low_z
-    for j in range(LANES):
-        i = h + U(j)
-        dx = np.float32(halves[i]) - x
-        dy = np.float32(halves[i + U(LANES)]) - y
-        dz = np.float32(halves[i + U(2 * LANES)]) - z
-        near |= dx * dx + dy * dy + dz * dz <= square
-    return near
+    # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
+    # lanes).
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
+    # The bits of non-negative floats sort like the numbers. The minimum of integers is vectorised;
+    # that of floats is not, because LLVM must allow for a NaN.
+    least = np.int32(0x7F800000)
+    for lane in range(LANES):
+        j = U(lane)
+        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
+        dz = np.float32(halves[at_z + j]) - z
+        square = np.float32(dx * dx + dy * dy + dz * dz)
+        squares[j] = square
+        least = min(least, square.view(np.int32))
+    return np.int32(least).view(np.float32)
+
+
+@njit_inlined
+def locate_block(ints, location, row, block_words):
+    """Locate the block of a leaf node: its place in `ints` and in `halves`, and its low corner.
+
+    The corner is relative to the frame, float32.  location: of its voxel.
+    """
+    number = ~np.int64(ints[U(row + FIRST)])
+    block_at = location.blocks + number * block_words
+    return (
+        block_at,
+        location.lanes + number * 3 * LANES,
+        location.x + np.float32(ints[U(block_at)]),
+        location.y + np.float32(ints[U(block_at + 1)]),
+        location.z + np.float32(ints[U(block_at + 2)]),
+    )
 
 
 @njit_no_refcount
@@ -351,3 +435,69 @@ def locate_voxel(scene, voxel, placed):
         np.float32(corners[voxel, 1] - frame[1]),
         np.float32(corners[voxel, 2] - frame[2]),
     )
+
+
+@nb.njit(nogil=True, cache=True)
+def lay_boxes(nodes, block_words, step, arena, where):
+    """Replace the slabs of a voxel's nodes by boxes where boxes are tighter.
+
+    nodes: number of the voxel's nodes, in rows that `lay_out` wrote, with their points.
+    block_words: of a block.  step: of the lattice [m].  where: (3,) int64, the voxel's runs.
+    """
+    words, ints, halves = arena
+    boxes = np.empty((nodes, 6), np.int32)  # least x, y, z, greatest x, y, z
+    room = ROOM / step
+    for node in range(nodes - 1, -1, -1):  # children follow their parents
+        row = where[0] + node * ROW_WORDS
+        first = np.int64(ints[row + FIRST])
+        if first < 0:
+            _box_of_block(
+                ints, halves, where[1] + ~first * block_words, where[2] + ~first * 3 * LANES, boxes, node
+            )
+        else:
+            for k in range(6):
+                boxes[node, k] = boxes[first, k]
+            for child in range(first + 1, first + np.int64(ints[row + COUNT] & COUNTED)):
+                for k in range(3):
+                    boxes[node, k] = min(boxes[node, k], boxes[child, k])
+                    boxes[node, 3 + k] = max(boxes[node, 3 + k], boxes[child, 3 + k])
+        _lay_box(words, row, boxes[node], room)
+
+
+@njit_no_refcount
+def _box_of_block(ints, halves, block_at, lane_at, boxes, node):
+    """Write the box of the points of a block. Lanes after the last point repeat it."""
+    for k in range(3):
+        least, most = np.int32(0xFFFF), np.int32(0)
+        for lane in range(LANES):
+            value = np.int32(halves[U(lane_at + k * LANES) + U(lane)])
+            least, most = min(least, value), max(most, value)
+        boxes[node, k] = ints[block_at + k] + least
+        boxes[node, 3 + k] = ints[block_at + k] + most
+
+
+@njit_no_refcount
+def _lay_box(words, row, box, room):
+    """Replace the slab of a row by its box if the box is tighter. room: `ROOM` [steps]."""
+    volume, square, moved, shortest = 1.0, 0.0, 0.0, np.inf
+    for k in range(3):
+        half = 0.5 * (np.float64(box[3 + k]) - box[k])
+        volume *= 2.0 * (half + room)
+        square += half * half
+        moved += (0.5 * (np.float64(box[3 + k]) + box[k]) - words[row + k]) ** 2
+        shortest = min(shortest, half)
+    around = np.float64(words[row + 3]) + room
+    of_slab = 4.0 / 3.0 * math.pi * around**3
+    if words[row + 4] != ZERO or words[row + 5] != ZERO or words[row + 6] != ZERO:
+        thick = (np.float64(words[row + 9]) - words[row + 8]) / words[row + 7]
+        of_slab = min(of_slab, math.pi * around * around * (thick + 2.0 * room))
+    if volume >= of_slab:
+        return
+    # Two steps of float32 upwards cover the rounding of the root and of the sum.
+    radius = min(math.sqrt(square), np.float64(words[row + 3]) + math.sqrt(moved)) * (1.0 + 2.0**-22)
+    for k in range(3):
+        words[row + k] = np.float32(0.5 * (np.float64(box[3 + k]) + box[k]))
+        words[row + 4 + k] = np.float32(0.5 * (np.float64(box[3 + k]) - box[k]))
+    words[row + 3] = np.float32(radius)
+    words[row + 7] = np.float32(-1.0)
+    words[row + 8], words[row + 9] = np.float32(-shortest), np.float32(shortest)

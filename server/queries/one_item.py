@@ -25,8 +25,7 @@ from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, SweepAnswer
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.core.array_references import record_type
-from ..kernels.motion.sweep_one import sweep_one
-from ..kernels.motion.sweep_resident import SWEPT, make_scratch
+from ..kernels.motion.sweep_resident import SWEPT, make_scratch, sweep_one
 from ..kernels.nearest import nearest_search as _nearest
 from ..kernels.nearest.nearest_search import nearest_resident
 from .collide import collide

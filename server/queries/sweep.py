@@ -11,10 +11,10 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_resident import make_scratch
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
+    advance_segments,
     find_unknown_regions,
     make_plan_space,
     plan_segments,

@@ -16,14 +16,12 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
-from ..core.node_overlap import U32
+from ..core.node_overlap import STACK, U32
 from ..core.placed_avatar import MAX_REACH_UNITS, largest_term, place, to_units
 from ..core.scene_arrays import LANES, stopped
 from ..motion.screw_motion import make_motion
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
-# As in node_overlap.py: a pair of trees leaves at most 15 pairs a level on the stack.
-STACK = 2 * 80 * 15 + 16
 # A rotation may shear by RIGID_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
 

@@ -24,10 +24,10 @@ from ..core.scene_arrays import SceneArrays, stopped
 from ..core.voxels_in_reach import VALID, check_poses
 from .moving_avatar import MovingAvatar, make_moving
 from .screw_motion import make_motion, pose_at
-from .sweep_advance import advance_segments
 from .sweep_segments import (
     PlanSpace,
     SweepProgress,
+    advance_segments,
     find_unknown_regions,
     make_plan_space,
     plan_segments,
@@ -301,3 +301,43 @@ def motion_bounds(pose_from, pose_to, box):
     """
     motion = make_motion(pose_from, pose_to, box, np.zeros(3))
     return motion.speed, motion.slip
+
+
+@nb.njit(nogil=True, cache=True)
+def sweep_one(
+    pose_from, pose_to, body, scratch, other_units, held, stop, unknown_everywhere, tolerance, result, outside
+):
+    """Return as `sweep_resident`, and write outside (1,) bool, whether the reach leaves the scene's bounds."""
+    found = sweep_resident(
+        pose_from,
+        pose_to,
+        body,
+        scratch,
+        other_units,
+        held,
+        stop,
+        unknown_everywhere,
+        tolerance,
+        -1.0,
+        result,
+    )
+    if found[0] >= 0:
+        scene, one = held.scene, scratch.one
+        from_zero = SceneArrays(
+            scene.words, scene.ints, scene.halves, scene.where, scene.corners, one.origin, scene.step,
+            scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
+        )  # fmt: skip
+        until = np.full(1, min(result.upper, 1.0))
+        find_unknown_regions(
+            body.box,
+            one.first,
+            one.last,
+            body.avatar,
+            one.units,
+            from_zero,
+            held.tree,
+            until,
+            outside,
+            np.empty(1),
+        )
+    return found

@@ -1,4 +1,4 @@
-"""State of one frame of a walking avatar, and the tape of its queries.
+"""State of one frame of a walking avatar, the tape of its queries, and its vectors.
 
 The frame's code asks queries, such as sweeps, one after the other. Each answer is a row of the tape.
 If a query cannot be answered in compiled code, because voxels have to be loaded or bodies are in the
@@ -7,8 +7,12 @@ again (server/simulation/world/walker.py). The kernel repeats the frame from its
 the known answers. Nothing in a frame depends on anything but its start and these answers, so it
 arrives at the same query again. There is therefore one implementation of a frame, whatever is in
 memory.
+
+Vectors are tuples of three float64. Their operations and the order of these are those of
+server/simulation/world/vectors.py, so that both give the same bits.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference, record_type, reference
+from ..core.kernel_decorators import njit_no_refcount
 from ..motion.sweep_resident import SWEPT, MotionScratch
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
@@ -227,3 +232,129 @@ def pose_now(walk):
 def blocked_pose(walk):
     """Return the pose (4, 4) where the motion command was obstructed; callers do not write to it."""
     return walk.memory.poses[1]
+
+
+@njit_no_refcount
+def vector(row):
+    """Return the vector in an array (3,)."""
+    return row[0], row[1], row[2]
+
+
+@njit_no_refcount
+def put(row, one):
+    """Write a vector to an array (3,)."""
+    row[0], row[1], row[2] = one[0], one[1], one[2]
+
+
+@njit_no_refcount
+def place_of(pose):
+    """Return the translation of a pose (4, 4)."""
+    return pose[0, 3], pose[1, 3], pose[2, 3]
+
+
+@njit_no_refcount
+def dot(one, other):
+    """Return the dot product."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+@njit_no_refcount
+def norm(one):
+    """Return the length."""
+    return math.sqrt(one[0] * one[0] + one[1] * one[1] + one[2] * one[2])
+
+
+@njit_no_refcount
+def plus(one, other):
+    """Return the sum."""
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+@njit_no_refcount
+def minus(one, other):
+    """Return the difference."""
+    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
+
+
+@njit_no_refcount
+def times(factor, one):
+    """Return a multiple."""
+    return factor * one[0], factor * one[1], factor * one[2]
+
+
+@njit_no_refcount
+def divided(one, by):
+    """Return the quotient of a vector and a number."""
+    return one[0] / by, one[1] / by, one[2] / by
+
+
+@njit_no_refcount
+def cross(one, other):
+    """Return the cross product."""
+    return (
+        one[1] * other[2] - one[2] * other[1],
+        one[2] * other[0] - one[0] * other[2],
+        one[0] * other[1] - one[1] * other[0],
+    )
+
+
+@njit_no_refcount
+def rotate(pose, one):
+    """Return a vector of the frame of a pose (4, 4) in the world."""
+    return (
+        pose[0, 0] * one[0] + pose[0, 1] * one[1] + pose[0, 2] * one[2],
+        pose[1, 0] * one[0] + pose[1, 1] * one[1] + pose[1, 2] * one[2],
+        pose[2, 0] * one[0] + pose[2, 1] * one[1] + pose[2, 2] * one[2],
+    )
+
+
+@njit_no_refcount
+def rotate_back(pose, one):
+    """Return a vector of the world in the frame of a pose (4, 4)."""
+    return (
+        pose[0, 0] * one[0] + pose[1, 0] * one[1] + pose[2, 0] * one[2],
+        pose[0, 1] * one[0] + pose[1, 1] * one[1] + pose[2, 1] * one[2],
+        pose[0, 2] * one[0] + pose[1, 2] * one[1] + pose[2, 2] * one[2],
+    )
+
+
+@njit_no_refcount
+def copy_pose(source, target):
+    """Copy a pose (4, 4) to another array."""
+    for r in range(4):
+        for c in range(4):
+            target[r, c] = source[r, c]
+
+
+@nb.njit(nogil=True, cache=True)
+def same_pose(one, other):
+    """Return whether two poses (4, 4) have the same bits."""
+    for r in range(4):
+        for c in range(4):
+            a, b = one[r, c], other[r, c]
+            if a != b or np.signbit(a) != np.signbit(b):
+                return False
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def translated(pose, way):
+    """Return a new pose (4, 4), translated by a vector."""
+    there = np.empty((4, 4))
+    copy_pose(pose, there)
+    for r in range(3):
+        there[r, 3] += way[r]
+    return there
+
+
+@njit_no_refcount
+def lowest_height(points, radius, pose, up):
+    """Return the lowest height of spheres under a pose, along `up` [m].
+
+    points: (n, 3) float64, their centres in the pose's frame; n > 0.  radius: [m].
+    """
+    down = rotate_back(pose, up)
+    least = np.inf
+    for n in range(points.shape[0]):
+        least = min(least, points[n, 0] * down[0] + points[n, 1] * down[1] + points[n, 2] * down[2])
+    return dot(place_of(pose), up) + least - radius

@@ -22,7 +22,7 @@ from ...kernels.core.array_references import Held
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import make_scratch
 from ...kernels.walk import state
-from ...kernels.walk.slide import FLAT_REACH_FACTOR
+from ...kernels.walk.motions import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
 from ...queries.one_item import MAX_FAST_POINTS
 from ...queries.request import EXACT

@@ -49,7 +49,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_boxes import has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
-from ..core.placed_avatar import lattice_to_units, pair_square, place, to_units
+from ..core.placed_avatar import lattice_to_units, pair_square, to_units
 from ..core.reach import HELD, INFINITE, state_of
 from ..core.scene_arrays import (
     COUNT,
@@ -64,6 +64,7 @@ from ..core.scene_arrays import (
 )
 from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at
+from .vectors import dot, minus, norm, place_of, placed, plus, point_of, put, times
 
 # Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
 # 0.87 to the band.
@@ -205,17 +206,14 @@ def _least(words, row, r):
 def _follows(sweep, chord, voxel, a, row):
     """Return whether every pair of two nodes that touches follows moving.pair (NUMERICS.md N11)."""
     scene, moving = sweep.scene, sweep.moving
-    x = scan_coordinate(scene, moving.pair, 0)
+    x, y, z = pair_point(scene, found_pair(moving))
     # A scan point that touches the avatar's node is within its radius and the reach; 1: rounding.
     reach = np.float64(moving.nodes[3, a]) + chord.outer / scene.units_per_step + 1.0
     if np.float64(moving.nodes[0, a]) - reach > np.float64(x - moving.frame[0]):
         return True
-    for r in range(3):
-        named = scan_coordinate(scene, moving.pair, r) - scene.corners[voxel, r]
-        least = _least(scene.words, row, r)
-        if least != np.float64(named):
-            return least > np.float64(named)
-    return False
+    least = _least(scene.words, row, 0), _least(scene.words, row, 1), _least(scene.words, row, 2)
+    corner = scene.corners[voxel]
+    return least > (np.float64(x - corner[0]), np.float64(y - corner[1]), np.float64(z - corner[2]))
 
 
 @njit_inlined
@@ -334,39 +332,25 @@ def pair_times(gap, displacement, inner, outer):
     comes within `inner`, rounded up; inf likewise. closest: the fraction of closest approach, in
     [0, 1].
     """
-    dot = gap[0] * displacement[0] + gap[1] * displacement[1] + gap[2] * displacement[2]
-    length = math.sqrt(
-        displacement[0] * displacement[0]
-        + displacement[1] * displacement[1]
-        + displacement[2] * displacement[2]
-    )
-    apart = math.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2])
+    length, apart = norm(displacement), norm(gap)
     # Rounding of these lines: a few half units in the last place of the lengths, which are integers
     # or far above 2^-500.
     slack = 2.0**-48 * (apart + length)
     outer, inner = outer + slack, inner - slack
-    at = -dot / (length * length) if length > 1e-100 else 0.0
+    at = -dot(gap, displacement) / (length * length) if length > 1e-100 else 0.0
     closest = min(max(at, 0.0), 1.0)
-    ex, ey, ez = (
-        gap[0] + closest * displacement[0],
-        gap[1] + closest * displacement[1],
-        gap[2] + closest * displacement[2],
-    )
-    if ex * ex + ey * ey + ez * ez > outer * outer:
+    nearest = plus(gap, times(closest, displacement))
+    if dot(nearest, nearest) > outer * outer:
         return INFINITE, INFINITE, closest
     earliest_possible, earliest_certain = INFINITE, INFINITE
     if apart <= outer:
         earliest_possible = 0.0
         if apart <= inner:
             return 0.0, 0.0, closest
-    if length <= 1e-100 or at <= 0.0:
-        return (
-            earliest_possible,
-            earliest_certain,
-            closest,
-        )  # never nearer than now, and contact is not certain now
-    ex, ey, ez = gap[0] + at * displacement[0], gap[1] + at * displacement[1], gap[2] + at * displacement[2]
-    square = ex * ex + ey * ey + ez * ez
+    if length <= 1e-100 or at <= 0.0:  # never nearer than now, and contact is not certain now
+        return earliest_possible, earliest_certain, closest
+    nearest = plus(gap, times(at, displacement))
+    square = dot(nearest, nearest)
     late = 2.0**-48 * (1.0 + apart / length)
     if earliest_possible > 0.0:
         earliest_possible = max(at - math.sqrt(max(outer * outer - square, 0.0)) / length - late, 0.0)
@@ -390,8 +374,7 @@ def touches_at(sweep, t, pair):
     """Return whether one pair (as in MovingAvatar) is in contact under M(t), by NUMERICS.md N5."""
     scene, moving = sweep.scene, sweep.moving
     pose_at(sweep.motion, t, moving.pose)
-    for r in range(3):
-        moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
+    put(moving.shift, minus(place_of(moving.pose), scene.origin))
     units = sweep.units - _deficit_of(scene, pair)
     block, lane, voxel, lane_at, block_at, j = pair
     square = pair_square(sweep.avatar, moving.pose, block, lane, moving, scene, voxel, lane_at, block_at, j)
@@ -399,10 +382,27 @@ def touches_at(sweep, t, pair):
 
 
 @njit_no_refcount
-def scan_coordinate(scene, pair, r):
-    """Return lattice coordinate r of a pair's scan point [steps]."""
-    low = scene.corners[pair[2], r] + np.int64(scene.ints[pair[4] + r])
-    return low + np.int64(scene.halves[pair[3] + r * LANES + pair[5]])
+def found_pair(moving):
+    """Return the pair that a search has found, see MovingAvatar."""
+    pair = moving.pair
+    return pair[0], pair[1], pair[2], pair[3], pair[4], pair[5]
+
+
+@njit_no_refcount
+def scan_point(scene, voxel, at, block, j):
+    """Return the lattice coordinates of a scan point [steps]. at, block: `lane_at`, `block_at` of a pair."""
+    corners, ints, halves = scene.corners, scene.ints, scene.halves
+    return (
+        corners[voxel, 0] + np.int64(ints[block]) + np.int64(halves[at + j]),
+        corners[voxel, 1] + np.int64(ints[block + 1]) + np.int64(halves[at + LANES + j]),
+        corners[voxel, 2] + np.int64(ints[block + 2]) + np.int64(halves[at + 2 * LANES + j]),
+    )
+
+
+@njit_no_refcount
+def pair_point(scene, pair):
+    """Return the lattice coordinates of a pair's scan point [steps]."""
+    return scan_point(scene, pair[2], pair[3], pair[4], pair[5])
 
 
 @njit_no_refcount
@@ -411,23 +411,18 @@ def _comes_first(sweep, pair, other):
 
     The scan point decides first, then the avatar's centre at the beginning of the chord.
     """
-    for r in range(3):
-        one, two = scan_coordinate(sweep.scene, pair, r), scan_coordinate(sweep.scene, other, r)
-        if one != two:
-            return one < two
-    for r in range(3):
-        a, b = _placed_coordinate(sweep, pair, r), _placed_coordinate(sweep, other, r)
-        if a != b:
-            return a < b
-    return False
+    one, two = pair_point(sweep.scene, pair), pair_point(sweep.scene, other)
+    if one != two:
+        return one < two
+    return _placed_units(sweep, pair) < _placed_units(sweep, other)
 
 
 @njit_no_refcount
-def _placed_coordinate(sweep, pair, r):
-    """Return coordinate r of a pair's avatar point at the beginning of the chord, exact units."""
-    moving, points = sweep.moving, sweep.avatar.points
-    x, y, z = points[pair[0], 0, pair[1]], points[pair[0], 1, pair[1]], points[pair[0], 2, pair[1]]
-    return to_units(place(moving.ends[0], moving.shifts[0], r, x, y, z))
+def _placed_units(sweep, pair):
+    """Return a pair's avatar point at the beginning of the chord, exact units."""
+    moving = sweep.moving
+    x, y, z = placed(moving.ends[0], moving.shifts[0], point_of(sweep.avatar.points, pair[0], pair[1]))
+    return to_units(x), to_units(y), to_units(z)
 
 
 @njit_no_refcount
@@ -454,21 +449,21 @@ def _certain_by_integers(sweep, chord, pair, earliest_possible, earliest_certain
 @njit_no_refcount
 def try_pair(sweep, chord, pair):
     """Update moving.first and moving.pair with one pair, in float64."""
-    scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
-    gap, displacement, first = moving.gap, moving.displacement, moving.first
-    if first[2] <= 0.0 and not _comes_first(sweep, pair, moving.pair):
+    scene, moving, first = sweep.scene, sweep.moving, sweep.moving.first
+    if first[2] <= 0.0 and not _comes_first(sweep, pair, found_pair(moving)):
         return
-    block, lane = pair[0], pair[1]
-    x, y, z = points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-    for r in range(3):
-        begin = place(moving.ends[0], moving.shifts[0], r, x, y, z) * UNITS_PER_METRE
-        end = place(moving.ends[1], moving.shifts[1], r, x, y, z) * UNITS_PER_METRE
-        steps = scan_coordinate(scene, pair, r)
-        gap[r] = begin - np.float64(lattice_to_units(steps, scene.units_per_step))
-        displacement[r] = end - begin
+    ends, shifts, per_step = moving.ends, moving.shifts, scene.units_per_step
+    point, steps = point_of(sweep.avatar.points, pair[0], pair[1]), pair_point(scene, pair)
+    begin = times(UNITS_PER_METRE, placed(ends[0], shifts[0], point))
+    end = times(UNITS_PER_METRE, placed(ends[1], shifts[1], point))
+    cloud = (
+        np.float64(lattice_to_units(steps[0], per_step)),
+        np.float64(lattice_to_units(steps[1], per_step)),
+        np.float64(lattice_to_units(steps[2], per_step)),
+    )
     deficit = np.float64(_deficit_of(scene, pair))
     earliest_possible, earliest_certain, closest = pair_times(
-        gap, displacement, chord.inner - deficit, chord.outer - deficit
+        minus(begin, cloud), minus(end, begin), chord.inner - deficit, chord.outer - deficit
     )
     if earliest_possible > first[2]:
         return
@@ -479,7 +474,7 @@ def try_pair(sweep, chord, pair):
         )
         key, best = earliest_certain, first[1]
     first[0] = min(first[0], earliest_possible)
-    if key < best or (key == best and key < INFINITE and _comes_first(sweep, pair, moving.pair)):
+    if key < best or (key == best and key < INFINITE and _comes_first(sweep, pair, found_pair(moving))):
         first[1], first[2] = earliest_certain, key
         for n in range(6):
             moving.pair[n] = pair[n]

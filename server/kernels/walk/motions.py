@@ -14,6 +14,20 @@ from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.normal_codes import MAX_NORMAL_REACH
 from ..motion.sweep_resident import MIN_MOTION, skin_fraction
+from ..motion.vectors import (
+    copy_pose,
+    cross,
+    divided,
+    dot,
+    minus,
+    norm,
+    place_of,
+    put,
+    same_pose,
+    times,
+    translated,
+    vector,
+)
 from .queries import (
     contact_normal,
     farthest_motion,
@@ -29,25 +43,7 @@ from .queries import (
     scan_heights,
     touching_point,
 )
-from .state import (
-    CLEAR,
-    CONTACT,
-    UNKNOWN,
-    blocked_pose,
-    copy_pose,
-    cross,
-    divided,
-    dot,
-    minus,
-    norm,
-    place_of,
-    pose_now,
-    put,
-    same_pose,
-    times,
-    translated,
-    vector,
-)
+from .state import CLEAR, CONTACT, UNKNOWN, blocked_pose, place_now, pose_now
 
 # First step back from a pose that turns out not to be clear [m], and its growth factor.
 FIRST_STEP_BACK, STEP_GROWTH = 1e-7, 4.0
@@ -115,12 +111,12 @@ def advance(walk, to):
     for _ in range(MAX_PUSHES):
         if same_pose(pose_now(walk), to):
             return -1
-        hit = first_hit(walk, to, walk.settings[0].tolerance, walk.settings[0].skin, False)
+        hit = first_hit(walk, to, False)
         if hit < 0:
             move_to(walk, to)
             return -1
         result = memory.tape[hit]
-        if result.has_end and (leaves or not walk.bodies):
+        if result.has_end:
             end = np.empty((4, 4))
             copy_pose(result.end, end)
             if not walk.bodies or is_clear(walk, end, True):
@@ -293,22 +289,18 @@ def slide_command(walk):
     if hit < 0:
         return
     target, begin = memory.target, place_of(memory.begin)
-    command, rest = minus(place_of(target), begin), minus(place_of(target), place_of(pose_now(walk)))
+    command, rest = minus(place_of(target), begin), minus(place_of(target), place_now(walk))
     far = norm(rest)
     if far > 0.0:
         # A turning avatar moves along an arc. With the whole remainder it could move farther than
         # commanded.
-        left = norm(command) - norm(minus(place_of(pose_now(walk)), begin))
+        left = norm(command) - norm(minus(place_now(walk), begin))
         rest = times(min(1.0, max(0.0, left) / far), rest)
         slide_along(walk, hit, rest, command, True)
-    pose, turned = pose_now(walk), target.copy()
-    same = True
+    turned = target.copy()
     for r in range(3):
-        turned[r, 3] = pose[r, 3]
-        for c in range(3):
-            same &= pose[r, c] == target[r, c] and np.signbit(pose[r, c]) == np.signbit(target[r, c])
-    if not same:
-        advance(walk, turned)
+        turned[r, 3] = pose_now(walk)[r, 3]
+    advance(walk, turned)
     keep_rest(walk, 0.0)
 
 
@@ -321,7 +313,7 @@ def slide_along(walk, hit, rest, command, upright):
     Return the hit that ended the motion, or -1.
     """
     surfaces = walk.settings[0].surfaces
-    start, most = minus(place_of(pose_now(walk)), minus(command, rest)), norm(command)
+    start, most = minus(place_now(walk), minus(command, rest)), norm(command)
     # Distinct planes touched so far. A plane that is touched again, or that the motion did not lead
     # into, is taken for a bump.
     planes, count = np.empty((surfaces, 3)), 0
@@ -337,8 +329,7 @@ def slide_along(walk, hit, rest, command, upright):
             elif count == surfaces:
                 return ended
             else:
-                for r in range(3):
-                    planes[count, r] = plane[r]
+                put(planes[count], plane)
                 count += 1
                 touched = ended
         free, way = clip(rest, planes, count)
@@ -347,25 +338,24 @@ def slide_along(walk, hit, rest, command, upright):
             flat_free, flat_way = _clip_one(rest, flat)
             if flat_known and flat_free and norm(flat_way) >= max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE):
                 way = flat_way
-                for r in range(3):
-                    planes[0, r] = flat[r]
-                _back_off(walk, flat, min(bump_height, dot(minus(start, place_of(pose_now(walk))), flat)))
+                put(planes[0], flat)
+                _back_off(walk, flat, min(bump_height, dot(minus(start, place_now(walk)), flat)))
             elif norm(way) < MIN_SLIDE_SHARE * norm(rest) or flat_known:
                 return ended
         elif free and norm(way) < MIN_SLIDE_SHARE * norm(rest):
             return ended
         if free:
-            way = limit_displacement(minus(place_of(pose_now(walk)), start), way, most)
+            way = limit_displacement(minus(place_now(walk), start), way, most)
         if not free or norm(way) < MIN_SLIDE or dot(way, command) <= 0.0:
             return ended
-        begin = place_of(pose_now(walk))
+        begin = place_now(walk)
         if not bumps:
             ended = advance(walk, translated(pose_now(walk), way))
         else:
             over, ended = _over_bump(walk, bump, way, command, start)
             if not over:
                 return ended
-        gone = dot(minus(place_of(pose_now(walk)), begin), way) / dot(way, way)
+        gone = dot(minus(place_now(walk), begin), way) / dot(way, way)
         rest = times(max(0.0, 1.0 - gone), way)
         if ended < 0:
             return -1
@@ -383,8 +373,7 @@ def _is_among(plane, planes, count):
 @nb.njit(nogil=True, cache=True)
 def _clip_one(rest, plane):
     planes = np.empty((1, 3))
-    for r in range(3):
-        planes[0, r] = plane[r]
+    put(planes[0], plane)
     return clip(rest, planes, 1)
 
 
@@ -397,8 +386,7 @@ def _over_bump(walk, out, way, command, start):
     Return whether that led farther along the motion command, and the hit that ended it. If not,
     the frame is restored.
     """
-    state, before = walk.memory.state[0], np.empty((4, 4))
-    copy_pose(pose_now(walk), before)
+    state, before = walk.memory.state[0], pose_now(walk).copy()
     origin, hits, ended = place_of(before), state.hits, -1
     most, least = norm(command), MIN_GAIN * norm(way) * norm(command)
     lift, last = FIRST_LIFT * walk.settings[0].lift, LAST_LIFT * walk.settings[0].lift
@@ -412,9 +400,9 @@ def _over_bump(walk, out, way, command, start):
         off = limit_displacement(minus(origin, start), times(lift, out), most)
         advance(walk, translated(before, off))
         state.hits = hits
-        on = limit_displacement(minus(place_of(pose_now(walk)), start), way, most)
+        on = limit_displacement(minus(place_now(walk), start), way, most)
         ended = advance(walk, translated(pose_now(walk), on))
-        if dot(minus(place_of(pose_now(walk)), origin), command) >= least:
+        if dot(minus(place_now(walk), origin), command) >= least:
             return True, ended
         move_to(walk, before)
         state.hits = hits
@@ -437,8 +425,8 @@ def _flat_plane(walk, hit, plane):
     if not known:
         return False, plane, 0.0
     both = np.empty((2, 3))
-    for r in range(3):
-        both[0, r], both[1, r] = normal[r], -normal[r]
+    put(both[0], normal)
+    put(both[1], times(-1.0, normal))
     high, low, _ = scan_heights(walk, hit, both, FLAT)
     wall = _wall(walk, normal)
     reach = min(FLAT_REACH_FACTOR * walk.settings[0].normal_reach, MAX_NORMAL_REACH)

@@ -30,7 +30,21 @@ from ..collide.collide_poses import collide_resident
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.reach import all_resident
 from ..core.voxels_in_reach import VALID
-from ..motion.sweep_resident import MAX_UNDECIDED, OPEN, PROVED, longest_way, pose_between, sweep_resident
+from ..motion.sweep_resident import MAX_UNDECIDED, longest_way, pose_between, sweep_resident
+from ..motion.vectors import (
+    copy_pose,
+    divided,
+    dot,
+    minus,
+    norm,
+    place_of,
+    put,
+    rotate,
+    rotate_back,
+    same_pose,
+    times,
+    vector,
+)
 from ..rays.hits import nearest_in_memory
 from ..rays.surface import add_near, voxels_near
 from .state import (
@@ -49,21 +63,10 @@ from .state import (
     TOUCHED,
     UNKNOWN,
     ask,
-    copy_pose,
-    divided,
-    dot,
-    minus,
     next_row,
-    norm,
-    place_of,
+    place_now,
     pose_now,
-    put,
-    rotate,
-    rotate_back,
-    same_pose,
-    times,
     use_voxels,
-    vector,
 )
 
 
@@ -106,12 +109,12 @@ def ask_at(walk, query, place):
 
 
 @nb.njit(nogil=True, cache=True)
-def _ask_motion(walk, query, to, tolerance, skin, below):
+def _ask_motion(walk, query, to, below):
     """Ask about the motion to a pose (4, 4)."""
-    memory, question = walk.memory, walk.memory.question[0]
+    memory = walk.memory
     copy_pose(pose_now(walk), memory.asked_poses[0])
     copy_pose(to, memory.asked_poses[1])
-    question.tolerance, question.skin, question.below = tolerance, skin, below
+    memory.question[0].below = below
     ask(memory, query)
 
 
@@ -133,32 +136,35 @@ def _is_far_from_bodies(walk, pose_from, pose_to):
 
 
 @nb.njit(nogil=True, cache=True)
-def first_hit(walk, to, tolerance, skin, below):
+def first_hit(walk, to, below):
     """Return the first hit of the motion from the frame's pose to a pose (4, 4).
 
-    skin: distance to keep from the hit [m], for its end; negative: not requested.
     below: for a search for ground, leave out bodies beside the avatar.
     """
-    memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
-        if not (walk.native and _sweep(walk, to, tolerance, skin, row)):
-            _ask_motion(walk, SWEPT_TO, to, tolerance, skin, below)
+    row, known = next_row(walk.memory)
+    if not known:
+        if not (walk.native and _sweep(walk, to, row)):
+            _ask_motion(walk, SWEPT_TO, to, below)
         if walk.bodies and not _is_far_from_bodies(walk, pose_now(walk), to):
-            _ask_motion(walk, BODIES_SWEPT, to, tolerance, skin, below)
-        memory.log[0].known = row + 1
-    return -1 if memory.tape[row].verdict == CLEAR else row
+            _ask_motion(walk, BODIES_SWEPT, to, below)
+    return -1 if walk.memory.tape[row].verdict == CLEAR else row
 
 
 @nb.njit(nogil=True, cache=True)
-def _sweep(walk, to, tolerance, skin, row):
+def _has_unknown(walk):
+    """Return whether a scan was left out anywhere, or a load proved the index wrong."""
+    return walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0
+
+
+@nb.njit(nogil=True, cache=True)
+def _sweep(walk, to, row):
     """Write the scene's answer about a motion to a row; return whether it is known."""
     memory = walk.memory
     result, pose = memory.tape[row], pose_now(walk)
-    within = max(tolerance, walk.least_tolerance)
+    within = max(walk.settings[0].tolerance, walk.least_tolerance)
     needed, verdict, visits, _, _ = sweep_resident(
         pose, to, walk.avatar, walk.scratch, walk.other_units, walk.held, walk.stop, walk.unknown_everywhere, within,
-        skin, result,
+        result,
     )  # fmt: skip
     if needed < 0:
         return False
@@ -171,15 +177,14 @@ def _sweep(walk, to, tolerance, skin, row):
         exact = apart == 0.0 or result.speed * apart <= within
         if not exact and not farthest_motion(walk, pose, to) * apart <= MAX_UNDECIDED:
             verdict = UNKNOWN
-    part_unknown = walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0
-    count_visits(walk, visits, (verdict == UNKNOWN and exact) or (not exact and part_unknown))
-    pair, ends = verdict == CONTACT, verdict == CONTACT and skin >= 0.0
-    result.verdict, result.archive = verdict, 0 if pair else -1
-    result.has_pair, result.has_point = pair, ends
-    result.has_end = ends and result.ended != OPEN
-    if result.has_end and result.ended != PROVED:
-        copy_pose(pose, result.end)
-    result.has_normal, result.named, result.unloaded, result.rest = False, False, False, 0.0
+    count_visits(walk, visits, (verdict == UNKNOWN and exact) or (not exact and _has_unknown(walk)))
+    result.verdict, result.has_pair, result.archive = (
+        verdict,
+        verdict == CONTACT,
+        0 if verdict == CONTACT else -1,
+    )
+    result.has_point, result.has_end, result.has_normal = False, False, False
+    result.named, result.unloaded, result.rest = False, False, 0.0
     return True
 
 
@@ -187,7 +192,7 @@ def _sweep(walk, to, tolerance, skin, row):
 def _collide(walk, pose):
     """Return the verdict of the scene at a pose (4, 4); -1 if it is not known."""
     memory, avatar = walk.memory, walk.avatar
-    if walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0:
+    if _has_unknown(walk):
         return -1
     copy_pose(pose, memory.one[0])
     fault, _, needed = collide_resident(
@@ -197,8 +202,7 @@ def _collide(walk, pose):
     if fault != VALID or needed < 0:
         return -1
     use_voxels(walk, needed)
-    found = memory.verdict[0]
-    verdict = CLEAR if found == CLEAR else UNKNOWN if found == UNKNOWN else CONTACT
+    verdict = np.int64(memory.verdict[0])
     count_visits(walk, np.int64(memory.counts[1, 0]), verdict == UNKNOWN)
     return verdict
 
@@ -212,8 +216,8 @@ def is_clear(walk, pose, proved):
     if proved and not walk.bodies:
         return True
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
+    row, known = next_row(memory)
+    if not known:
         copy_pose(pose, memory.asked_poses[0])
         memory.question[0].proved = proved
         verdict = CLEAR if proved else _collide(walk, pose) if walk.native else -1
@@ -222,7 +226,6 @@ def is_clear(walk, pose, proved):
         if verdict == CLEAR and walk.bodies and not _is_far_from_bodies(walk, pose, pose):
             ask(memory, BODIES_AT)
         memory.tape[row].answer = verdict == CLEAR
-        memory.log[0].known = row + 1
     return memory.tape[row].answer
 
 
@@ -230,14 +233,13 @@ def is_clear(walk, pose, proved):
 def hit_at(walk, pose):
     """Return a hit with fraction 0 if a pose (4, 4) touches something or is unknown."""
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
+    row, known = next_row(memory)
+    if not known:
         far = not walk.bodies or _is_far_from_bodies(walk, pose, pose)
         if not far or not walk.native or _collide(walk, pose) != CLEAR:
             copy_pose(pose, memory.asked_poses[0])
             ask(memory, TOUCHED)
         memory.tape[row].verdict = CLEAR
-        memory.log[0].known = row + 1
     return -1 if memory.tape[row].verdict == CLEAR else row
 
 
@@ -247,10 +249,10 @@ def gives_way(walk, hit, to):
     memory = walk.memory
     if not memory.tape[hit].named:
         return False
-    row = next_row(memory)
-    if row >= memory.log[0].known:
+    row, known = next_row(memory)
+    if not known:
         memory.question[0].hit = hit
-        _ask_motion(walk, GIVES_WAY, to, 0.0, 0.0, False)
+        _ask_motion(walk, GIVES_WAY, to, False)
     return memory.tape[row].answer
 
 
@@ -258,19 +260,18 @@ def gives_way(walk, hit, to):
 def nearest_point(walk, place, reach):
     """Return the row with the scan point nearest to a place within `reach` [m]; -1 if there is none."""
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
-        needed, known, visits = -1, False, 0
-        if walk.native and not (walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0):
+    row, known = next_row(memory)
+    if not known:
+        needed, is_found, visits = -1, False, 0
+        if walk.native and not _has_unknown(walk):
             cloud = memory.tape[row].cloud
-            needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, cloud)
+            needed, is_found, visits = nearest_in_memory(walk.held, place, reach, walk.stop, cloud)
         if needed < 0:
             memory.question[0].reach = reach
             ask_at(walk, NEAREST, place)
         use_voxels(walk, needed)
         count_visits(walk, visits, False)
-        memory.tape[row].has_pair, memory.tape[row].archive = known, 0
-        memory.log[0].known = row + 1
+        memory.tape[row].has_pair, memory.tape[row].archive = is_found, 0
     return row if memory.tape[row].has_pair else -1
 
 
@@ -281,8 +282,8 @@ def lands(walk, reach, stood):
     reach: distance below that is free [m].  stood: whether it stood in the last frame.
     """
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
+    row, known = next_row(memory)
+    if not known:
         copy_pose(pose_now(walk), memory.asked_poses[0])
         memory.question[0].reach, memory.question[0].stood = reach, stood
         ask(memory, LANDS)
@@ -292,8 +293,7 @@ def lands(walk, reach, stood):
 @nb.njit(nogil=True, cache=True)
 def motion_left(walk, to):
     """Return the length of the translation from the frame's pose to a pose (4, 4) [m]."""
-    pose = pose_now(walk)
-    return norm((to[0, 3] - pose[0, 3], to[1, 3] - pose[1, 3], to[2, 3] - pose[2, 3]))
+    return norm(minus(place_of(to), place_now(walk)))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -355,12 +355,12 @@ def scan_normal(walk, archive, cloud, toward, level):
     is taken.
     """
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
-        known, code = _code(walk, cloud, level)
-        if known and code == NO_NORMAL:
-            known, code = _code(walk, cloud, level + 1)
-        if not known:
+    row, known = next_row(memory)
+    if not known:
+        is_found, code = _code(walk, cloud, level)
+        if is_found and code == NO_NORMAL:
+            is_found, code = _code(walk, cloud, level + 1)
+        if not is_found:
             question = memory.question[0]
             put(question.toward, toward)
             question.archive, question.level = archive, level
@@ -370,7 +370,6 @@ def scan_normal(walk, archive, cloud, toward, level):
             found = decode_normal(code)
             found = times(-1.0 if dot(found, toward) < 0.0 else 1.0, found)
             put(memory.tape[row].normal, found)
-        memory.log[0].known = row + 1
     result = memory.tape[row]
     return result.has_normal, vector(result.normal)
 
@@ -392,18 +391,17 @@ def scan_heights(walk, hit, directions, level):
     directions: (k, 3) unit.  level: as for `scan_normal`. Of further directions, the heights are zero.
     """
     memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[0].known:
-        archive, (_, cloud) = memory.tape[hit].archive, pair_of(walk, hit)
+    row, known = next_row(memory)
+    if not known:
+        _, cloud = pair_of(walk, hit)
         count, heights, sums = directions.shape[0], np.zeros(3), np.zeros(SUMS, np.int64)
         if not _add_near(walk, cloud, level, sums, directions, heights[:count]):
             question = memory.question[0]
-            question.archive, question.level, question.count = archive, level, count
+            question.archive, question.level, question.count = memory.tape[hit].archive, level, count
             for n in range(count):
                 put(question.directions[n], vector(directions[n]))
             ask_at(walk, HIGHEST, cloud)
         put(memory.tape[row].heights, times(walk.held.scene.step, vector(heights)))
-        memory.log[0].known = row + 1
     return vector(memory.tape[row].heights)
 
 

@@ -9,7 +9,23 @@ from typing import NamedTuple
 import numpy as np
 
 from ....schemas.runtime import compiling as nb
+from ..core.kernel_decorators import njit_no_refcount
 from ..motion.sweep_resident import MIN_MOTION
+from ..motion.vectors import (
+    Vector,
+    copy_pose,
+    divided,
+    dot,
+    minus,
+    norm,
+    place_of,
+    plus,
+    put,
+    rotate_back,
+    times,
+    translated,
+    vector,
+)
 from .motions import (
     advance,
     follow_command,
@@ -31,35 +47,20 @@ from .state import (
     UNKNOWN,
     Walk,
     blocked_pose,
-    copy_pose,
-    divided,
-    dot,
-    lowest_height,
-    minus,
-    norm,
-    place_of,
-    plus,
+    place_now,
     pose_now,
-    put,
-    times,
-    translated,
-    vector,
 )
 
 
 @nb.njit(nogil=True, cache=True)
 def walk_frame(
-    parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, scratch, memory, held,
-    stop, unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares, bounds,
-    kinds, bounds_origin, wanted, own, margin,
+    parts, settings, avatar, scratch, memory, held, stop, unknown_everywhere, alone, native, bodies, other_units,
+    least_tolerance, tolerance_units, squares, bounds, kinds, bounds_origin, wanted, own, margin,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
 
-    parts: bits of FOLLOW to GROUND.  starts: whether the frame begins; if not, the arguments up to
-    `clear` are those of the first call.  begin, target, pose: (4, 4), where the frame began, the commanded
-    pose, and the pose reached.  seconds: duration of the frame.  fell: speed of falling [m/s].
-    stood: whether the avatar stood.  verdict: of the frame.  clear: whether `pose` is known to be clear.
-    settings, memory: see state.py.  avatar: reference to its arrays.  scratch: of its motions.
+    parts: bits of FOLLOW to GROUND.  settings: see state.py.  avatar: reference to its arrays.
+    scratch: of its motions.  memory: of the frame; the caller has written how it begins.
     held: reference to the scene's arrays.  stop, unknown_everywhere, other_units: as for
     `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
     may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
@@ -74,12 +75,12 @@ def walk_frame(
         own, margin,
     )  # fmt: skip
     if memory.log[0].repeats:
-        _copy(memory.saved_bytes, memory.bytes, memory.saved_poses, memory.poses)
+        memory.state[0] = memory.saved_state[0]
+        _copy_poses(memory.saved_poses, memory.poses)
     else:
         _clear_log(memory.log[0])
-        if starts:
-            _start(memory, begin, target, pose, seconds, fell, stood, verdict, clear)
-        _copy(memory.bytes, memory.saved_bytes, memory.poses, memory.saved_poses)
+        memory.saved_state[0] = memory.state[0]
+        _copy_poses(memory.poses, memory.saved_poses)
     state = memory.state[0]
     if parts & FOLLOW:
         state.part = 0
@@ -104,27 +105,10 @@ def _clear_log(log):
 
 
 @nb.njit(nogil=True, cache=True)
-def _start(memory, begin, target, pose, seconds, fell, stood, verdict, clear):
-    """Write the state of a frame at its beginning, but for its hits, which are on the tape."""
-    before, state, known = memory.before[0], memory.state[0], memory.log[0].known
-    copy_pose(begin, memory.begin)
-    copy_pose(target, memory.target)
-    copy_pose(pose, memory.poses[0])
-    before.seconds, before.fall_speed, before.stood = seconds, fell, stood
-    memory.bytes[:] = 0
-    state.row, state.hits = known, known
-    for n in range(known):
-        memory.hits[n].row, memory.hits[n].has_normal = n, False
-    state.blocked, state.verdict, state.clear, state.stepped = -1, verdict, clear, np.nan
-
-
-@nb.njit(nogil=True, cache=True)
-def _copy(values, to_values, poses, to_poses):
-    """Save what a part changes, or restore it. Hits are restored by their number."""
-    for n in range(values.shape[0]):
-        to_values[n] = values[n]
-    for n in range(poses.shape[0]):
-        copy_pose(poses[n], to_poses[n])
+def _copy_poses(source, target):
+    """Save the poses that a part changes, or restore them. Hits are restored by their number."""
+    for n in range(source.shape[0]):
+        copy_pose(source[n], target[n])
 
 
 # A point belongs to the last ground if it is within these distances of its plane and of the point of
@@ -157,8 +141,23 @@ WALL_BAND = 5e-3
 # it was raised [m]. With a part wedged under a slope or over the edge of a sheet, the heights of the
 # ground a millimetre apart may differ by centimetres. It would rise and sink in turn.
 SAME_PLACE = 5e-3
+# For `search_below`: the search within the near reach has not been made.
+NOT_SEARCHED = -2
 # Longest time for which gravity acts in one frame [s].
 LONGEST_FRAME = 0.1
+
+
+@njit_no_refcount
+def lowest_height(points, radius, pose, up):
+    """Return the lowest height of spheres under a pose, along `up` [m].
+
+    points: (n, 3) float64, their centres in the pose's frame; n > 0.  radius: [m].
+    """
+    down = rotate_back(pose, up)
+    least = np.inf
+    for n in range(points.shape[0]):
+        least = min(least, points[n, 0] * down[0] + points[n, 1] * down[1] + points[n, 2] * down[2])
+    return dot(place_of(pose), up) + least - radius
 
 
 @nb.njit(nogil=True, cache=True)
@@ -234,7 +233,7 @@ class GroundBelow(NamedTuple):
     reach: float
     free: float
     stands: bool
-    normal: tuple[float, float, float]
+    normal: Vector
     same: bool
     aside: bool
 
@@ -243,7 +242,7 @@ class GroundBelow(NamedTuple):
 def first_below(walk, reach):
     """Return the first hit straight down from the frame's pose within `reach` [m]."""
     to = translated(pose_now(walk), times(-reach, vector(walk.settings[0].up)))
-    return first_hit(walk, to, walk.settings[0].tolerance, -1.0, True)
+    return first_hit(walk, to, True)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -264,15 +263,14 @@ def _beside_walls(walk):
 
 
 @nb.njit(nogil=True, cache=True)
-def search_below(walk, reach, near_known, near):
+def search_below(walk, reach, near):
     """Find the first contact straight down from the frame's pose within `reach` [m].
 
-    near_known: whether the search within the near reach has been made.  near: its result.
+    near: result of the search within the near reach, or NOT_SEARCHED.
     Bumps of a wall beside the avatar may end the motion. After a contact that is too steep, the
     search is therefore repeated slightly away from it.
     """
-    begin, near_reach = np.empty((4, 4)), walk.settings[0].near_reach
-    copy_pose(pose_now(walk), begin)
+    begin, near_reach = pose_now(walk).copy(), walk.settings[0].near_reach
     moved, aside = _beside_walls(walk)
     first = GroundBelow(-1, reach, reach, False, (0.0, 0.0, 0.0), False, moved)
     for offset in WALL_OFFSETS:  # away from the contact before
@@ -280,21 +278,20 @@ def search_below(walk, reach, near_known, near):
             move_to(walk, translated(begin, aside))
         # Ground is nearly always near, and a short sweep takes half the time.
         far = min(reach, near_reach)
-        hit = near if near_known else first_below(walk, far)
-        near_known = False
+        hit = first_below(walk, far) if near == NOT_SEARCHED else near
+        near = NOT_SEARCHED
         if hit < 0 and far < reach:
             far = reach
             hit = first_below(walk, far)
         move_to(walk, begin)
-        if hit < 0:
-            return GroundBelow(-1, far, far, False, (0.0, 0.0, 0.0), False, moved)
-        result = walk.memory.tape[hit]
-        free = result.lower * far
-        if result.verdict == UNKNOWN:
-            return GroundBelow(hit, far, free, False, (0.0, 0.0, 0.0), False, moved)
-        stands, normal, same = walkable_normal(walk, hit)
+        free, is_known, stands, normal, same = far, False, False, (0.0, 0.0, 0.0), False
+        if hit >= 0:
+            result = walk.memory.tape[hit]
+            free, is_known = result.lower * far, result.verdict != UNKNOWN
+        if is_known:
+            stands, normal, same = walkable_normal(walk, hit)
         found = GroundBelow(hit, far, free, stands, normal, same, moved)
-        if stands:
+        if stands or not is_known:
             return found
         if first.hit < 0:
             first = found
@@ -360,11 +357,11 @@ def walkable_normal(walk, hit):
 @nb.njit(nogil=True, cache=True)
 def move_by(walk, way, upright):
     """Move by a displacement [m], sliding along touched surfaces; upright: as in `slide_along`."""
-    state, begin = walk.memory.state[0], place_of(pose_now(walk))
+    state, begin = walk.memory.state[0], place_now(walk)
     hits = state.hits
     hit = advance(walk, translated(pose_now(walk), way))
     if hit >= 0 and walk.settings[0].slides:
-        gone = minus(place_of(pose_now(walk)), begin)
+        gone = minus(place_now(walk), begin)
         slide_along(walk, hit, minus(way, gone), way, upright)
     state.hits = hits
 
@@ -389,18 +386,16 @@ def stand_on_ground(walk):
     memory, settings = walk.memory, walk.settings[0]
     state, before = memory.state[0], memory.before[0]
     stood, up = before.stood, vector(settings.up)
-    near_known, near = False, -1
+    near = NOT_SEARCHED
     if stood and state.hits == 0:
-        near_known, near = True, first_below(walk, settings.near_reach)
+        near = first_below(walk, settings.near_reach)
         if near >= 0 and _keeps_height(walk, near):
             return
     seconds = min(before.seconds, LONGEST_FRAME)
     speed = 0.0 if stood else before.fall_speed
     after = min(speed + settings.gravity * seconds, settings.max_speed)
     fall = 0.5 * (speed + after) * seconds
-    below = search_below(
-        walk, max(settings.down if stood else 0.0, fall + settings.clearance), near_known, near
-    )
+    below = search_below(walk, max(settings.down if stood else 0.0, fall + settings.clearance), near)
     hit, stands, fall_speed = below.hit, False, after
     has_normal, normal = below.stands, below.normal
     if hit < 0 and not _would_land(walk, below.reach, stood):
@@ -409,7 +404,7 @@ def stand_on_ground(walk):
         lower_by(walk, below, fall)
     elif memory.tape[hit].verdict == UNKNOWN:
         # Something below is unknown, so there may be ground: the avatar does not fall.
-        _record_unknown(walk, hit)
+        record_hit(walk, hit, pose_now(walk))
         lower_by(walk, below, min(fall, below.free - settings.clearance))
         stands, fall_speed = stood, 0.0
     elif below.stands:
@@ -425,14 +420,14 @@ def stand_on_ground(walk):
         elif lower < -band:
             move_by(walk, times(-lower, up), False)
             state.raised = True
-            put(state.raised_at, place_of(pose_now(walk)))
+            put(state.raised_at, place_now(walk))
     elif stood and is_held_above_ground(walk, hit, settings.down):
         stands, fall_speed = True, 0.0
         has_normal, (_, normal) = True, old_plane(walk)
     else:
-        begin = place_of(pose_now(walk))
+        begin = place_now(walk)
         move_by(walk, times(-fall, up), False)
-        fell = -dot(minus(place_of(pose_now(walk)), begin), up)
+        fell = -dot(minus(place_now(walk), begin), up)
         if seconds > 0.0:
             fall_speed = min(fall_speed, max(fell, 0.0) / seconds)
     _report(walk, stands, fall_speed, has_normal, normal)
@@ -466,16 +461,6 @@ def _keeps_height(walk, hit):
 
 
 @nb.njit(nogil=True, cache=True)
-def _record_unknown(walk, hit):
-    """Record a hit below whose motion had no commanded end."""
-    result = walk.memory.tape[hit]
-    unloaded = result.unloaded
-    result.unloaded = False  # nothing of the motion command was left for it
-    record_hit(walk, hit, pose_now(walk))
-    result.unloaded = unloaded
-
-
-@nb.njit(nogil=True, cache=True)
 def _would_land(walk, reach, stood):
     """Return whether an avatar without ground within `reach` [m] of its feet may land."""
     row = lands(walk, reach, stood)
@@ -483,7 +468,7 @@ def _would_land(walk, reach, stood):
     if result.unloaded:
         # Whether it would land is not known until the voxels below are in memory: it waits there.
         result.verdict, result.archive, result.has_pair, result.lower = UNKNOWN, -1, False, 0.0
-        _record_unknown(walk, row)
+        record_hit(walk, row, pose_now(walk))
         return False
     return result.answer
 
@@ -495,7 +480,7 @@ def _was_raised_here(walk):
     if not memory.before[0].was_raised or memory.state[0].blocked < 0 or not memory.before[0].stood:
         return False
     place = vector(memory.before[0].raised_at)
-    return norm(minus(place_of(pose_now(walk)), place)) <= SAME_PLACE
+    return norm(minus(place_now(walk), place)) <= SAME_PLACE
 
 
 # The climb must lead this much farther than sliding [m], and by this share of the remainder.
@@ -517,7 +502,7 @@ def step_up(walk):
     if length < MIN_MOTION:
         return
     along = divided(command, length)
-    so_far = dot(minus(place_of(pose_now(walk)), begin), along)
+    so_far = dot(minus(place_now(walk), begin), along)
     feet = lowest_height(walk.avatar.points, walk.avatar.radius, blocked_pose(walk), up)
     top = feet + settings.step
     low = _is_low(walk, hit, top)
@@ -528,8 +513,7 @@ def step_up(walk):
     least = so_far + max(MIN_CLIMB_GAIN, MIN_CLIMB_GAIN_SHARE * (length - so_far))
     if not low or least >= length:  # walls
         return
-    before, hits, verdict = np.empty((4, 4)), state.hits, state.verdict
-    copy_pose(pose_now(walk), before)
+    before, hits, verdict = pose_now(walk).copy(), state.hits, state.verdict
     move_to(walk, blocked_pose(walk))
     climbed, rose = _climb(walk, along, length, least)
     if climbed:
@@ -558,16 +542,16 @@ def _climb(walk, along, length, least):
     Return whether the motion ends on ground that is not too high, and the height gained [m].
     """
     settings, begin = walk.settings[0], place_of(walk.memory.begin)
-    up, start = vector(settings.up), place_of(pose_now(walk))
+    up, start = vector(settings.up), place_now(walk)
     move_by(walk, times(settings.step, up), False)  # sliding avoids the bumps of the riser
-    rose = dot(minus(place_of(pose_now(walk)), start), up)
+    rose = dot(minus(place_now(walk), start), up)
     if rose < MIN_MOTION:
         return False, rose
-    gone = dot(minus(place_of(pose_now(walk)), begin), along)
+    gone = dot(minus(place_now(walk), begin), along)
     move_by(walk, times(length - gone, along), True)  # along a jamb beside the step
-    if dot(minus(place_of(pose_now(walk)), begin), along) < least:
+    if dot(minus(place_now(walk), begin), along) < least:
         return False, rose
-    below = search_below(walk, rose + 2.0 * settings.clearance, False, -1)
+    below = search_below(walk, rose + 2.0 * settings.clearance, NOT_SEARCHED)
     if not below.stands:
         return False, rose
     lower = below.free - settings.clearance
@@ -575,6 +559,6 @@ def _climb(walk, along, length, least):
         return False, rose
     lower_by(walk, below, lower)
     # Sliding down along a surface may have moved the avatar back.
-    if dot(minus(place_of(pose_now(walk)), begin), along) < least:
+    if dot(minus(place_now(walk), begin), along) < least:
         return False, rose
-    return True, dot(minus(place_of(pose_now(walk)), start), up)
+    return True, dot(minus(place_now(walk), start), up)

@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
-from ..core.kernel_decorators import njit_inlined, njit_no_refcount
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.placed_avatar import Avatar, largest_term, place
 from ..core.reach import INFINITE
 from ..core.scene_arrays import LANES, stopped
+from ..motion.moving_avatar import least_square
 from ..motion.screw_motion import ScrewMotion, make_motion, pose_at
 from ..motion.sweep_interval import LEAST_SAGITTA, pair_times
 from ..motion.sweep_segments import CHORD_BEND, MAX_REFUSED, longest_part
@@ -111,14 +112,6 @@ class BodyChord(NamedTuple):
     outer: float
     threshold: float
     final: bool
-
-
-@njit_inlined
-def _least_square(gx, gy, gz, wx, wy, wz, inverse, latest):
-    """Return the least square of a vector that moves from g to g + latest w; inverse: 1 / w^2."""
-    t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
-    ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
-    return ex * ex + ey * ey + ez * ez
 
 
 @njit_no_refcount
@@ -235,7 +228,7 @@ def _mark_near(scratch, block_a, block_b, j, threshold):
     for k in range(LANES):
         px, py, pz = paths[block_a, 0, k], paths[block_a, 1, k], paths[block_a, 2, k]
         wx, wy, wz = paths[block_a, 3, k], paths[block_a, 4, k], paths[block_a, 5, k]
-        square = _least_square(px - bx, py - by, pz - bz, wx, wy, wz, paths[block_a, 6, k], latest)
+        square = least_square(px - bx, py - by, pz - bz, wx, wy, wz, paths[block_a, 6, k], latest)
         qx, qy, qz = px + latest * wx, py + latest * wy, pz + latest * wz
         keep[k] = (
             (square <= span)
@@ -277,12 +270,12 @@ def _leaves(sweep, chord, i, j):
         touched = False
         for k in range(LANES):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
-            touched |= _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
+            touched |= least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
         if not touched:
             continue
         for k in range(sweep.b.avatar.count[j]):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
-            if _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
+            if least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
                 _try_pair(sweep, chord, block_a, lane, block_b, k)
                 latest = _latest(scratch)
 
@@ -295,7 +288,7 @@ def _nearest(scratch, threshold, i, j):
     """
     moving, standing = scratch.moving, scratch.standing
     both = (moving[7, i] + standing[3, j] + threshold) * (1.0 + 1e-12)
-    square = _least_square(
+    square = least_square(
         moving[0, i] - standing[0, j], moving[1, i] - standing[1, j], moving[2, i] - standing[2, j],
         moving[3, i], moving[4, i], moving[5, i], moving[6, i], _latest(scratch),
     )  # fmt: skip

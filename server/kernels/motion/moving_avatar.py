@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RADIUS_CLASSES
 from ....schemas.runtime import compiling as nb
-from ..core.kernel_decorators import njit_no_refcount
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.placed_avatar import Avatar, largest_term, place
 from ..core.scene_arrays import LANES, SceneArrays
@@ -121,6 +121,17 @@ def make_moving(avatar):
         np.empty((2, RADIUS_CLASSES), np.float32), np.zeros(5, np.int64), np.empty(LANES, np.bool_),
         np.empty(3, np.float32), np.empty((STACK, 2), np.int64),
     )  # fmt: skip
+
+
+@njit_inlined
+def least_square(x, y, z, dx, dy, dz, inverse, latest):
+    """Return the least square of a vector that moves from (x, y, z) by up to `latest` times (dx, dy, dz).
+
+    All of one type, float32 or float64. inverse: 1 / the square of (dx, dy, dz).
+    """
+    t = min(max(-(x * dx + y * dy + z * dz) * inverse, ZERO), latest)
+    ex, ey, ez = x + t * dx, y + t * dy, z + t * dz
+    return ex * ex + ey * ey + ez * ez
 
 
 @njit_no_refcount

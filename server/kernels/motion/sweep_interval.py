@@ -62,7 +62,7 @@ from ..core.scene_arrays import (
     point_class,
     stopped,
 )
-from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
+from .moving_avatar import AvatarChord, least_square, place_block, place_nodes
 from .screw_motion import pose_at
 from .vectors import dot, minus, norm, place_of, placed, plus, point_of, put, times
 
@@ -85,9 +85,7 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     wx, wy, wz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     span = radius + threshold
     both = words[at + U(3)] + span
-    t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-    ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-    if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
+    if least_square(wx, wy, wz, dx, dy, dz, inverse, latest) > both * both * ONE_SLACK:
         return False
     if has_box(words, row):
         # One branch on all sides costs less than six that are hard to predict.
@@ -137,9 +135,7 @@ def _leaves(sweep, chord, voxel, block, row):
     for j in range(LANES):
         dx, dy, dz = displacements[own, 0, j], displacements[own, 1, j], displacements[own, 2, j]
         wx, wy, wz = lanes[own, 0, j] - cx, lanes[own, 1, j] - cy, lanes[own, 2, j] - cz
-        t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[own, 3, j], ZERO), latest)
-        ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-        near = ex * ex + ey * ey + ez * ez <= square
+        near = least_square(wx, wy, wz, dx, dy, dz, displacements[own, 3, j], latest) <= square
         if boxed:
             ex, ey, ez = wx + latest * dx, wy + latest * dy, wz + latest * dz
             near &= (min(wx, ex) <= nx + wide) & (max(wx, ex) >= -nx - wide)
@@ -177,18 +173,14 @@ def _leaves(sweep, chord, voxel, block, row):
             wx = x - np.float32(halves[at_x + U(j)])
             wy = y - np.float32(halves[at_y + U(j)])
             wz = z - np.float32(halves[at_z + U(j)])
-            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-            touched |= ex * ex + ey * ey + ez * ez <= far
+            touched |= least_square(wx, wy, wz, dx, dy, dz, inverse, latest) <= far
         if not touched:
             continue
         for j in range(LANES):
             wx = x - np.float32(halves[at_x + U(j)])
             wy = y - np.float32(halves[at_y + U(j)])
             wz = z - np.float32(halves[at_z + U(j)])
-            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-            square = ex * ex + ey * ey + ez * ez
+            square = least_square(wx, wy, wz, dx, dy, dz, inverse, latest)
             if square <= far and square <= thresholds[1, point_class(ints, block_at, j, mask)]:
                 try_pair(sweep, chord, (block, lane, voxel, lane_at, block_at, j))
                 latest = _latest(moving)

@@ -34,43 +34,36 @@ def place_of(pose):
 
 @njit_no_refcount
 def dot(one, other):
-    """Return the dot product."""
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 @njit_no_refcount
 def norm(one):
-    """Return the length."""
     return math.sqrt(one[0] * one[0] + one[1] * one[1] + one[2] * one[2])
 
 
 @njit_no_refcount
 def plus(one, other):
-    """Return the sum."""
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 @njit_no_refcount
 def minus(one, other):
-    """Return the difference."""
     return one[0] - other[0], one[1] - other[1], one[2] - other[2]
 
 
 @njit_no_refcount
 def times(factor, one):
-    """Return a multiple."""
     return factor * one[0], factor * one[1], factor * one[2]
 
 
 @njit_no_refcount
 def divided(one, by):
-    """Return the quotient of a vector and a number."""
     return one[0] / by, one[1] / by, one[2] / by
 
 
 @njit_no_refcount
 def cross(one, other):
-    """Return the cross product."""
     return (
         one[1] * other[2] - one[2] * other[1],
         one[2] * other[0] - one[0] * other[2],

@@ -37,7 +37,6 @@ from .queries import (
     hit_normal,
     is_clear,
     keep_point,
-    motion_left,
     pair_of,
     pose_on_way,
     scan_heights,
@@ -63,7 +62,7 @@ def record_hit(walk, hit, to):
     memory = walk.memory
     result, state = memory.tape[hit], memory.state[0]
     if result.unloaded:
-        result.rest = motion_left(walk, to)
+        result.rest = norm(minus(place_of(to), place_now(walk)))
     memory.hits[state.hits].row, memory.hits[state.hits].has_normal = hit, False
     state.hits += 1
     if result.verdict == UNKNOWN and state.verdict == CLEAR:
@@ -129,6 +128,12 @@ def advance(walk, to):
             break
     record_hit(walk, hit, to)
     return hit
+
+
+@nb.njit(nogil=True, cache=True)
+def advance_by(walk, way):
+    """Advance by a displacement [m]; return the hit that ended the motion."""
+    return advance(walk, translated(pose_now(walk), way))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -335,12 +340,13 @@ def slide_along(walk, hit, rest, command, upright):
         free, way = clip(rest, planes, count)
         if count == 1 and free and upright and norm(way) < NEARLY_HEAD_ON * norm(rest):
             flat_known, flat, bump_height = _flat_plane(walk, touched, vector(planes[0]))
-            flat_free, flat_way = _clip_one(rest, flat)
-            if flat_known and flat_free and norm(flat_way) >= max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE):
-                way = flat_way
+            if flat_known:
                 put(planes[0], flat)
+                free, way = clip(rest, planes, 1)
+                if not free or norm(way) < max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE):
+                    return ended
                 _back_off(walk, flat, min(bump_height, dot(minus(start, place_now(walk)), flat)))
-            elif norm(way) < MIN_SLIDE_SHARE * norm(rest) or flat_known:
+            elif norm(way) < MIN_SLIDE_SHARE * norm(rest):
                 return ended
         elif free and norm(way) < MIN_SLIDE_SHARE * norm(rest):
             return ended
@@ -350,7 +356,7 @@ def slide_along(walk, hit, rest, command, upright):
             return ended
         begin = place_now(walk)
         if not bumps:
-            ended = advance(walk, translated(pose_now(walk), way))
+            ended = advance_by(walk, way)
         else:
             over, ended = _over_bump(walk, bump, way, command, start)
             if not over:
@@ -368,13 +374,6 @@ def _is_among(plane, planes, count):
     for n in range(count):
         found |= dot(plane, vector(planes[n])) > SAME_PLANE_COSINE
     return found
-
-
-@nb.njit(nogil=True, cache=True)
-def _clip_one(rest, plane):
-    planes = np.empty((1, 3))
-    put(planes[0], plane)
-    return clip(rest, planes, 1)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -397,11 +396,9 @@ def _over_bump(walk, out, way, command, start):
             # Nearly head on, a longer way off the surface costs more than the motion gains.
             lift = last = less
     while True:
-        off = limit_displacement(minus(origin, start), times(lift, out), most)
-        advance(walk, translated(before, off))
+        advance_by(walk, limit_displacement(minus(origin, start), times(lift, out), most))
         state.hits = hits
-        on = limit_displacement(minus(place_now(walk), start), way, most)
-        ended = advance(walk, translated(pose_now(walk), on))
+        ended = advance_by(walk, limit_displacement(minus(place_now(walk), start), way, most))
         if dot(minus(place_now(walk), origin), command) >= least:
             return True, ended
         move_to(walk, before)
@@ -445,7 +442,7 @@ def _back_off(walk, out, way):
     state = walk.memory.state[0]
     way, hits = min(way, LAST_LIFT * walk.settings[0].lift), state.hits
     if way >= MIN_SLIDE:
-        advance(walk, translated(pose_now(walk), times(way, out)))
+        advance_by(walk, times(way, out))
         state.hits = hits
 
 

@@ -47,27 +47,8 @@ from ..motion.vectors import (
 )
 from ..rays.hits import nearest_in_memory
 from ..rays.surface import add_near, voxels_near
-from .state import (
-    BODIES_AT,
-    BODIES_SWEPT,
-    CLEAR,
-    CLEAR_AT,
-    CONTACT,
-    GIVES_WAY,
-    HIGHEST,
-    LANDS,
-    NEAR,
-    NEAREST,
-    NORMAL_AT,
-    SWEPT_TO,
-    TOUCHED,
-    UNKNOWN,
-    ask,
-    next_row,
-    place_now,
-    pose_now,
-    use_voxels,
-)
+from . import state
+from .state import CLEAR, CONTACT, NEAR, UNKNOWN, ask, next_row, pose_now, use_voxels
 
 
 @nb.njit(nogil=True, cache=True)
@@ -144,9 +125,9 @@ def first_hit(walk, to, below):
     row, known = next_row(walk.memory)
     if not known:
         if not (walk.native and _sweep(walk, to, row)):
-            _ask_motion(walk, SWEPT_TO, to, below)
+            _ask_motion(walk, state.SWEPT_TO, to, below)
         if walk.bodies and not _is_far_from_bodies(walk, pose_now(walk), to):
-            _ask_motion(walk, BODIES_SWEPT, to, below)
+            _ask_motion(walk, state.BODIES_SWEPT, to, below)
     return -1 if walk.memory.tape[row].verdict == CLEAR else row
 
 
@@ -222,9 +203,9 @@ def is_clear(walk, pose, proved):
         memory.question[0].proved = proved
         verdict = CLEAR if proved else _collide(walk, pose) if walk.native else -1
         if verdict < 0:
-            ask(memory, CLEAR_AT)
+            ask(memory, state.CLEAR_AT)
         if verdict == CLEAR and walk.bodies and not _is_far_from_bodies(walk, pose, pose):
-            ask(memory, BODIES_AT)
+            ask(memory, state.BODIES_AT)
         memory.tape[row].answer = verdict == CLEAR
     return memory.tape[row].answer
 
@@ -238,7 +219,7 @@ def hit_at(walk, pose):
         far = not walk.bodies or _is_far_from_bodies(walk, pose, pose)
         if not far or not walk.native or _collide(walk, pose) != CLEAR:
             copy_pose(pose, memory.asked_poses[0])
-            ask(memory, TOUCHED)
+            ask(memory, state.TOUCHED)
         memory.tape[row].verdict = CLEAR
     return -1 if memory.tape[row].verdict == CLEAR else row
 
@@ -252,7 +233,7 @@ def gives_way(walk, hit, to):
     row, known = next_row(memory)
     if not known:
         memory.question[0].hit = hit
-        _ask_motion(walk, GIVES_WAY, to, False)
+        _ask_motion(walk, state.GIVES_WAY, to, False)
     return memory.tape[row].answer
 
 
@@ -268,7 +249,7 @@ def nearest_point(walk, place, reach):
             needed, is_found, visits = nearest_in_memory(walk.held, place, reach, walk.stop, cloud)
         if needed < 0:
             memory.question[0].reach = reach
-            ask_at(walk, NEAREST, place)
+            ask_at(walk, state.NEAREST, place)
         use_voxels(walk, needed)
         count_visits(walk, visits, False)
         memory.tape[row].has_pair, memory.tape[row].archive = is_found, 0
@@ -286,14 +267,8 @@ def lands(walk, reach, stood):
     if not known:
         copy_pose(pose_now(walk), memory.asked_poses[0])
         memory.question[0].reach, memory.question[0].stood = reach, stood
-        ask(memory, LANDS)
+        ask(memory, state.LANDS)
     return row
-
-
-@nb.njit(nogil=True, cache=True)
-def motion_left(walk, to):
-    """Return the length of the translation from the frame's pose to a pose (4, 4) [m]."""
-    return norm(minus(place_of(to), place_now(walk)))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -339,14 +314,6 @@ def _add_near(walk, place, level, sums, directions, heights):
 
 
 @nb.njit(nogil=True, cache=True)
-def _code(walk, place, level):
-    """Return whether the normal at a place is known, and its code. level: as for `scan_normal`."""
-    sums = np.zeros(SUMS, np.int64)
-    known = _add_near(walk, place, level, sums, np.empty((0, 3)), np.empty(0))
-    return known, normal_code(sums)
-
-
-@nb.njit(nogil=True, cache=True)
 def scan_normal(walk, archive, cloud, toward, level):
     """Return whether the normal at a scan point is known, and it: a unit vector on the side of `toward`.
 
@@ -357,14 +324,17 @@ def scan_normal(walk, archive, cloud, toward, level):
     memory = walk.memory
     row, known = next_row(memory)
     if not known:
-        is_found, code = _code(walk, cloud, level)
-        if is_found and code == NO_NORMAL:
-            is_found, code = _code(walk, cloud, level + 1)
+        is_found, code = True, NO_NORMAL
+        for each in (level, level + 1):
+            if is_found and code == NO_NORMAL:
+                sums = np.zeros(SUMS, np.int64)
+                is_found = _add_near(walk, cloud, each, sums, np.empty((0, 3)), np.empty(0))
+                code = normal_code(sums)
         if not is_found:
             question = memory.question[0]
             put(question.toward, toward)
             question.archive, question.level = archive, level
-            ask_at(walk, NORMAL_AT, cloud)
+            ask_at(walk, state.NORMAL_AT, cloud)
         memory.tape[row].has_normal = code != NO_NORMAL
         if code != NO_NORMAL:
             found = decode_normal(code)
@@ -400,7 +370,7 @@ def scan_heights(walk, hit, directions, level):
             question.archive, question.level, question.count = memory.tape[hit].archive, level, count
             for n in range(count):
                 put(question.directions[n], vector(directions[n]))
-            ask_at(walk, HIGHEST, cloud)
+            ask_at(walk, state.HIGHEST, cloud)
         put(memory.tape[row].heights, times(walk.held.scene.step, vector(heights)))
     return vector(memory.tape[row].heights)
 

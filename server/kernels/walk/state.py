@@ -122,7 +122,18 @@ WalkMemory = reference(WalkArrays)
 
 @reference
 class Walk(NamedTuple):
-    """All that a frame reads and writes, see `walk_frame`."""
+    """All that a frame reads and writes.
+
+    avatar: reference to its arrays.  scratch: of its motions.  memory: state of the frame; the caller has
+    written how it begins.  held: reference to the scene's arrays.
+    stop, unknown_everywhere, other_units: as for `sweep_resident`.  alone: whether the scene is one
+    archive at the identity.  native: whether queries may be answered here: it is alone, and the avatar is
+    small and not empty.  bodies: whether other bodies are obstacles.
+    least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
+    squares: (3,) int64, the normal reach, thrice and nine times that, squared [steps^2]; 0 if invalid.
+    bounds, kinds, bounds_origin, wanted, own: of the bodies that may be in the way, as for
+    `find_near_bodies`.  margin: distance to keep from them [m].
+    """
 
     settings: NDArray[np.void]
     avatar: AvatarReference
@@ -178,11 +189,7 @@ def make_arrays(rows: int) -> WalkArrays:
 @nb.njit(nogil=True, cache=True)
 def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
-    return WalkMemory(
-        arrays.tape, arrays.log, arrays.question, arrays.before, arrays.state, arrays.saved_state, arrays.hits,
-        arrays.begin, arrays.target, arrays.poses, arrays.saved_poses, arrays.asked_poses, arrays.used,
-        arrays.verdict, arrays.counts, arrays.one,
-    )  # fmt: skip
+    return WalkMemory(*arrays)
 
 
 @nb.njit(nogil=True, cache=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ....schemas.runtime import compiling as nb
-from ..core.kernel_decorators import njit_no_refcount
+from ..bodies.leave_contact import find_heights
 from ..motion.sweep_resident import MIN_MOTION
 from ..motion.vectors import (
     Vector,
@@ -27,7 +27,7 @@ from ..motion.vectors import (
     vector,
 )
 from .motions import (
-    advance,
+    advance_by,
     follow_command,
     keep_rest,
     move_to,
@@ -53,27 +53,13 @@ from .state import (
 
 
 @nb.njit(nogil=True, cache=True)
-def walk_frame(
-    parts, settings, avatar, scratch, memory, held, stop, unknown_everywhere, alone, native, bodies, other_units,
-    least_tolerance, tolerance_units, squares, bounds, kinds, bounds_origin, wanted, own, margin,
-):  # fmt: skip
+def walk_frame(parts, given):
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
 
-    parts: bits of FOLLOW to GROUND.  settings: see state.py.  avatar: reference to its arrays.
-    scratch: of its motions.  memory: of the frame; the caller has written how it begins.
-    held: reference to the scene's arrays.  stop, unknown_everywhere, other_units: as for
-    `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
-    may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
-    are obstacles.  least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
-    squares: (3,) int64, the normal reach, thrice and nine times that, squared [steps^2]; 0 if invalid.
-    bounds, kinds, bounds_origin, wanted, own: of the bodies that may be in the way, as for
-    `find_near_bodies`.  margin: distance to keep from them [m].
+    parts: bits of FOLLOW to GROUND.  given: the fields of `Walk`.
     """
-    walk = Walk(
-        settings, avatar, scratch, memory, held, stop, unknown_everywhere, alone, native, bodies,
-        other_units, least_tolerance, tolerance_units, squares, bounds, kinds, bounds_origin, wanted,
-        own, margin,
-    )  # fmt: skip
+    walk = Walk(*given)
+    memory = walk.memory
     if memory.log[0].repeats:
         memory.state[0] = memory.saved_state[0]
         _copy_poses(memory.saved_poses, memory.poses)
@@ -147,17 +133,13 @@ NOT_SEARCHED = -2
 LONGEST_FRAME = 0.1
 
 
-@njit_no_refcount
-def lowest_height(points, radius, pose, up):
-    """Return the lowest height of spheres under a pose, along `up` [m].
-
-    points: (n, 3) float64, their centres in the pose's frame; n > 0.  radius: [m].
-    """
-    down = rotate_back(pose, up)
-    least = np.inf
-    for n in range(points.shape[0]):
-        least = min(least, points[n, 0] * down[0] + points[n, 1] * down[1] + points[n, 2] * down[2])
-    return dot(place_of(pose), up) + least - radius
+@nb.njit(nogil=True, cache=True)
+def lowest_height(walk, pose):
+    """Return the lowest height of the spheres of the avatar, not empty, under a pose, along `up` [m]."""
+    up, direction, heights = vector(walk.settings[0].up), np.empty((1, 3)), np.empty(1)
+    put(direction[0], times(-1.0, rotate_back(pose, up)))
+    find_heights(walk.avatar, direction, heights)
+    return dot(place_of(pose), up) - heights[0] - walk.avatar.radius
 
 
 @nb.njit(nogil=True, cache=True)
@@ -207,11 +189,11 @@ def is_held_above_ground(walk, hit, reach):
     its feet are at the floor. It would fall a little in each frame, and be raised again.
     hit: the contact below.  reach: height up to which contacts are with ground or steps [m].
     """
-    memory, avatar, up = walk.memory, walk.avatar, vector(walk.settings[0].up)
-    if not memory.before[0].has_plane or not memory.tape[hit].has_pair or avatar.points.shape[0] == 0:
+    memory, up = walk.memory, vector(walk.settings[0].up)
+    if not memory.before[0].has_plane or not memory.tape[hit].has_pair or walk.avatar.points.shape[0] == 0:
         return False
     pose = pose_now(walk)
-    feet, place = lowest_height(avatar.points, avatar.radius, pose, up), place_of(pose)
+    feet, place = lowest_height(walk, pose), place_of(pose)
     (_, cloud), (point, normal) = pair_of(walk, hit), old_plane(walk)
     if dot(cloud, up) - feet <= reach:
         return False
@@ -359,7 +341,7 @@ def move_by(walk, way, upright):
     """Move by a displacement [m], sliding along touched surfaces; upright: as in `slide_along`."""
     state, begin = walk.memory.state[0], place_now(walk)
     hits = state.hits
-    hit = advance(walk, translated(pose_now(walk), way))
+    hit = advance_by(walk, way)
     if hit >= 0 and walk.settings[0].slides:
         gone = minus(place_now(walk), begin)
         slide_along(walk, hit, minus(way, gone), way, upright)
@@ -493,7 +475,7 @@ SLID_SHARE = 0.5
 def step_up(walk):
     """Climb the obstacle that stopped the motion command, if possible."""
     memory, settings, state = walk.memory, walk.settings[0], walk.memory.state[0]
-    up, hit = vector(settings.up), state.blocked
+    hit = state.blocked
     if hit < 0 or not memory.before[0].stood or not memory.tape[hit].has_pair:
         return
     begin = place_of(memory.begin)
@@ -503,8 +485,7 @@ def step_up(walk):
         return
     along = divided(command, length)
     so_far = dot(minus(place_now(walk), begin), along)
-    feet = lowest_height(walk.avatar.points, walk.avatar.radius, blocked_pose(walk), up)
-    top = feet + settings.step
+    top = lowest_height(walk, blocked_pose(walk)) + settings.step
     low = _is_low(walk, hit, top)
     if not so_far > SLID_SHARE * length:
         # Beside a wall that is touched first, a step is touched while sliding.

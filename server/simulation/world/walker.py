@@ -379,12 +379,13 @@ class Walker:
                     if blocks:
                         margin = max([each.margin for each in obstacles])
                     with bodies.lock, residency.frozen():
-                        self._code.call(
-                            walk_frame, parts, self._settings, avatar.reference, scratch, thread.reference,
-                            held.reference, data.arrays.stop, data.nothing_clear, alone, native, blocks,
-                            data.radius_units, float(budget.tolerance), budget.tolerance_units, squares, bodies.bounds,
-                            bodies.kinds, bodies.origin, wanted, bodies.row_of(body.name, user=True), margin,
+                        given = (
+                            self._settings, avatar.reference, scratch, thread.reference, held.reference,
+                            data.arrays.stop, data.nothing_clear, alone, native, blocks, data.radius_units,
+                            float(budget.tolerance), budget.tolerance_units, squares, bodies.bounds, bodies.kinds,
+                            bodies.origin, wanted, bodies.row_of(body.name, user=True), margin,
                         )  # fmt: skip
+                        self._code.call(walk_frame, parts, given)
                         log, used = thread.log, thread.log.used.item()
                         if used:
                             rows = thread.memory.used[:used]

@@ -181,7 +181,7 @@ ORDER = (
 )  # fmt: skip
 # Version of the rules by which effects move an avatar; a log states that of its frames. A change that
 # gives other poses from the same motion commands increases it. 2: normals of contacts at edges
-# (server/kernels/walk/normals.py). 3: nearly head-on pushes at flat walls, pushed objects on
+# (server/kernels/walk/queries.py). 3: nearly head-on pushes at flat walls, pushed objects on
 # floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands
 # that last for more than a frame. 5: normals count the points of all voxels.
 MOTION_VERSION = 5

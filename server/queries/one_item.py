@@ -25,8 +25,7 @@ from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, SweepAnswer
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.core.array_references import record_type
-from ..kernels.motion.sweep_one import sweep_one
-from ..kernels.motion.sweep_resident import SWEPT, make_scratch
+from ..kernels.motion.sweep_resident import SWEPT, make_scratch, sweep_resident
 from ..kernels.nearest import nearest_search as _nearest
 from ..kernels.nearest.nearest_search import nearest_resident
 from .collide import collide
@@ -136,13 +135,13 @@ def sweep_fast(
         or not 0 < len(avatar.points) <= MAX_FAST_POINTS
     ):
         return sweep(data, avatar, first, last, margin, tolerance, budget)
-    residency, result, outside = data.residency, np.zeros(1, _SWEPT), np.zeros(1, bool)
+    residency, result = data.residency, np.zeros(1, _SWEPT)
     other_units = data.radius_units + to_units(margin, "margin")
     held = data.references.to(data.arrays, data.tree)
     with residency.frozen():
         needed, said, visits, tests, steps = held.call(
-            sweep_one, first[0], last[0], avatar.reference, make_scratch(avatar.arrays), other_units, held.reference,
-            budget.stop.flag, data.nothing_clear, float(most), result[0], outside,
+            sweep_resident, first[0], last[0], avatar.reference, make_scratch(avatar.arrays), other_units,
+            held.reference, budget.stop.flag, data.nothing_clear, float(most), result[0],
         )  # fmt: skip
         if needed > 0:
             residency.use(held.rows[:needed].tolist(), scan=budget.scan)
@@ -157,7 +156,7 @@ def sweep_fast(
         verdict=np.array([said], np.uint8), lower=lower, upper=upper, exact=exact,
         witness_avatar=result["avatar"] if touches else nothing,
         witness_cloud=result["cloud"] if touches else nothing.copy(), steps=np.array([steps], np.uint32),
-        outside=outside, voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
+        outside=result["outside"], voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
         point_tests=np.array([tests], np.uint32), engine_seconds=time.perf_counter() - begin, hits=needed,
         resident=residency.resident, resident_bytes=residency.resident_bytes,
     )  # fmt: skip

@@ -11,10 +11,10 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_resident import make_scratch
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
+    advance_segments,
     find_unknown_regions,
     make_plan_space,
     plan_segments,
@@ -175,7 +175,17 @@ def sweep_steps(
     until = np.minimum(progress.upper, 1.0)
     unknown = np.empty(k)
     find_unknown_regions(
-        box, first, last, avatar.arrays, units, data.arrays, data.tree, until, outside, unknown
+        box,
+        first,
+        last,
+        avatar.arrays,
+        units,
+        data.arrays,
+        data.tree,
+        until,
+        make_plan_space(),
+        outside,
+        unknown,
     )
     if data.nothing_clear:
         unknown[:] = 0.0

@@ -12,18 +12,21 @@ poses would add a rounding that no bound needs. Points are compared in float32 r
 centre of one of the two leaf nodes, with a certified band in which integers decide.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
-from ..core.node_bounds import U32
-from ..core.placed_avatar import MAX_REACH_UNITS, largest_term, place, to_units
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_bounds import STACK, U32
+from ..core.placed_avatar import MAX_REACH_UNITS, Avatar, largest_term, place, to_units
 from ..core.scene_arrays import LANES, stopped
 from ..motion.screw_motion import make_motion
+from ..motion.vectors import Vector, dot, minus, place_of, placed, point_of, vector
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
-# As in node_bounds.py: a pair of trees leaves at most 15 pairs a level on the stack.
-STACK = 2 * 80 * 15 + 16
 # A rotation may shear by RIGID_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
 
@@ -70,19 +73,15 @@ def bound_objects(avatar, poses, which, units, origin, margin_units, low, high):
     Half the margin is added on either side. The boxes are rounded outward by much
     more than the rounding of placing.
     """
-    shift = np.empty(3)
-    for at in range(which.shape[0]):
-        i = which[at]
-        m = poses[i]
-        for r in range(3):
-            shift[r] = m[r, 3] - origin[r]
-        x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
-        extent = avatar.radius[0] * STRETCH
-        slack = 2.0 / UNITS_PER_METRE + (largest_term(m, shift, x, y, z) + extent) * 2.0**-49
+    root = vector(avatar.center[0])
+    for i in which:
+        shift, extent = minus(place_of(poses[i]), origin), avatar.radius[0] * STRETCH
+        slack = 2.0 / UNITS_PER_METRE
+        slack += (largest_term(poses[i], shift, root[0], root[1], root[2]) + extent) * 2.0**-49
         extent += np.float64(units[i] + margin_units / 2) / UNITS_PER_METRE + slack
+        center = placed(poses[i], shift, root)
         for r in range(3):
-            center = place(m, shift, r, x, y, z)
-            low[i, r], high[i, r] = center - extent, center + extent
+            low[i, r], high[i, r] = center[r] - extent, center[r] + extent
 
 
 @nb.njit(nogil=True, cache=True)
@@ -128,47 +127,52 @@ def find_near_bodies(box, first, last, origin, more, bounds, kinds, wanted, skip
     return count
 
 
-@nb.njit(nogil=True, cache=True)
-def _place_lanes(avatar, m, shift, block, center, lanes):
-    """Write the points of a leaf node, float32, relative to `center` (3,), to lanes (3, LANES)."""
-    points = avatar.points
+class PlacedBody(NamedTuple):
+    """Avatar under a pose (4, 4). shift: t - O [m]."""
+
+    avatar: Avatar
+    pose: NDArray[np.float64]
+    shift: Vector
+
+
+@njit_no_refcount
+def _place_lanes(body, block, center, lanes):
+    """Write the points of a leaf node, float32, relative to `center`, to lanes (3, LANES)."""
+    points, m, shift = body.avatar.points, body.pose, body.shift
     for r in range(3):
         for j in range(LANES):
             world = place(m, shift, r, points[block, 0, j], points[block, 1, j], points[block, 2, j])
             lanes[r, j] = np.float32(world - center[r])
 
 
-@nb.njit(nogil=True, cache=True)
-def _points_touch(a, ma, shift_a, block_a, lane_a, b, mb, shift_b, block_b, lane_b, units):
+@njit_no_refcount
+def _points_touch(a, block_a, lane_a, b, block_b, lane_b, units):
     """Return whether one pair of points touches, by the definition."""
     square = np.int64(0)
-    p, q = a.points, b.points
+    one = placed(a.pose, a.shift, point_of(a.avatar.points, block_a, lane_a))
+    other = placed(b.pose, b.shift, point_of(b.avatar.points, block_b, lane_b))
     for r in range(3):
-        one = place(ma, shift_a, r, p[block_a, 0, lane_a], p[block_a, 1, lane_a], p[block_a, 2, lane_a])
-        other = place(mb, shift_b, r, q[block_b, 0, lane_b], q[block_b, 1, lane_b], q[block_b, 2, lane_b])
-        difference = to_units(one) - to_units(other)
+        difference = to_units(one[r]) - to_units(other[r])
         if abs(difference) > MAX_REACH_UNITS:
             return False
         square += difference * difference
     return square <= units * units
 
 
-@nb.njit(nogil=True, cache=True)
-def _leaves_touch(
-    a, ma, shift_a, node_a, b, mb, shift_b, node_b, radius_b, center, units, error, lanes, counters
-):
+@njit_no_refcount
+def _leaves_touch(a, node_a, b, node_b, radius_b, center, units, error, lanes, counters):
     """Return whether two leaf nodes hold a pair in contact.
 
-    center: (3,), placed centre of the node of b.  radius_b: of that node, as placed [m].  lanes:
+    center: placed centre of the node of b.  radius_b: of that node, as placed [m].  lanes:
     (2, 3, LANES), scratch.
     Coordinates are relative to `center`. For points in contact, and for all of b's points, they are
     at most radius_b + reach in size. Their rounding and that of their differences is below 4 U32 of
     it; that of the square's root is below 16 U32.
     """
-    block_a, block_b = ~a.first[node_a], ~b.first[node_b]
+    block_a, block_b = ~a.avatar.first[node_a], ~b.avatar.first[node_b]
     one, other = lanes[0], lanes[1]
-    _place_lanes(a, ma, shift_a, block_a, center, one)
-    _place_lanes(b, mb, shift_b, block_b, center, other)
+    _place_lanes(a, block_a, center, one)
+    _place_lanes(b, block_b, center, other)
     reach = np.float64(units) / UNITS_PER_METRE
     band = error + 16.0 * U32 * (radius_b + reach + error)
     far = np.float32((reach + band) * (reach + band) * (1.0 + 16.0 * U32))
@@ -176,7 +180,7 @@ def _leaves_touch(
     near = np.float32(below * below * (1.0 - 16.0 * U32)) if below > 0.0 else np.float32(-1.0)
     span = radius_b + reach + band
     around = np.float32(span * span * (1.0 + 16.0 * U32))
-    for i in range(a.count[node_a]):
+    for i in range(a.avatar.count[node_a]):
         x, y, z = one[0, i], one[1, i], one[2, i]
         if x * x + y * y + z * z > around:
             continue
@@ -187,76 +191,65 @@ def _leaves_touch(
             touched |= dx * dx + dy * dy + dz * dz <= far
         if not touched:
             continue
-        for j in range(b.count[node_b]):
+        for j in range(b.avatar.count[node_b]):
             dx, dy, dz = other[0, j] - x, other[1, j] - y, other[2, j] - z
             square = dx * dx + dy * dy + dz * dz
             if square <= near:
                 return True
-            if square <= far and _points_touch(a, ma, shift_a, block_a, i, b, mb, shift_b, block_b, j, units):
+            if square <= far and _points_touch(a, block_a, i, b, block_b, j, units):
                 return True
     return False
 
 
-@nb.njit(nogil=True, cache=True)
-def touch_bodies(a, ma, b, mb, units, origin, stop, nodes, at, lanes, counters):
+@njit_no_refcount
+def _touch_bodies(one, other, units, stop, nodes, lanes, counters):
     """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the stop flag ended the search.
 
     The descent follows [Fig12] figures 5 and 6, corrected as in collide_poses.py: the larger inner
     node is opened, a leaf never is.
-    nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs still to examine, and their
-    placed centres.
+    nodes: (STACK, 2) int64, scratch: pairs still to examine.
     """
-    shift_a, shift_b = np.empty(3), np.empty(3)
-    for r in range(3):
-        shift_a[r], shift_b[r] = ma[r, 3] - origin[r], mb[r, 3] - origin[r]
-    p, q = a.center, b.center
-    largest = largest_term(ma, shift_a, p[0, 0], p[0, 1], p[0, 2]) + a.radius[0] * STRETCH
-    largest = max(largest, largest_term(mb, shift_b, q[0, 0], q[0, 1], q[0, 2]) + b.radius[0] * STRETCH)
+    a, b = one.avatar, other.avatar
     # Rounding of two points to units, and of all sums that place a point or a centre.
-    error = 2.0 / UNITS_PER_METRE + largest * 2.0**-47
+    error = 2.0 / UNITS_PER_METRE + max(_largest(one), _largest(other)) * 2.0**-47
     reach = np.float64(units) / UNITS_PER_METRE + error
-    for r in range(3):
-        at[0, r] = place(ma, shift_a, r, p[0, 0], p[0, 1], p[0, 2])
-        at[0, 3 + r] = place(mb, shift_b, r, q[0, 0], q[0, 1], q[0, 2])
     nodes[0, 0], nodes[0, 1] = 0, 0
-    here = np.empty(6)
     counters[0] += 1
     depth = 1
     while depth > 0:
         depth -= 1
         i, j = nodes[depth, 0], nodes[depth, 1]
-        for r in range(6):
-            here[r] = at[depth, r]
         radius_a, radius_b = a.radius[i] * STRETCH, b.radius[j] * STRETCH
-        dx, dy, dz = here[0] - here[3], here[1] - here[4], here[2] - here[5]
+        center = placed(other.pose, other.shift, b.center[j])
+        gap = minus(placed(one.pose, one.shift, a.center[i]), center)
         both = (radius_a + radius_b + reach) * (1.0 + 1e-12)
-        if dx * dx + dy * dy + dz * dz > both * both:
+        if dot(gap, gap) > both * both:
             continue
         if stopped(stop):
             return UNKNOWN
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
-            if _leaves_touch(
-                a, ma, shift_a, i, b, mb, shift_b, j, radius_b, here[3:], units, error, lanes, counters
-            ):  # fmt: skip
+            if _leaves_touch(one, i, other, j, radius_b, center, units, error, lanes, counters):
                 return CONTACT
         elif first_b < 0 or (first_a >= 0 and radius_a > radius_b):
             counters[0] += a.count[i]
             for child in range(first_a, first_a + a.count[i]):
                 nodes[depth, 0], nodes[depth, 1] = child, j
-                for r in range(3):
-                    at[depth, r] = place(ma, shift_a, r, p[child, 0], p[child, 1], p[child, 2])
-                    at[depth, 3 + r] = here[3 + r]
                 depth += 1
         else:
             counters[0] += b.count[j]
             for child in range(first_b, first_b + b.count[j]):
                 nodes[depth, 0], nodes[depth, 1] = i, child
-                for r in range(3):
-                    at[depth, r] = here[r]
-                    at[depth, 3 + r] = place(mb, shift_b, r, q[child, 0], q[child, 1], q[child, 2])
                 depth += 1
     return CLEAR
+
+
+@njit_no_refcount
+def _largest(body):
+    """Return a bound of the terms of any placed coordinate [m]."""
+    root = body.avatar.center[0]
+    term = largest_term(body.pose, body.shift, root[0], root[1], root[2])
+    return term + body.avatar.radius[0] * STRETCH
 
 
 @nb.njit(nogil=True, cache=True)
@@ -269,8 +262,7 @@ def touch_pairs(a, b, poses, units, pairs, margin_units, origin, stop, verdict, 
     stop flag; once it is set, pairs are UNKNOWN.
     Writes verdict (p,) uint8; adds to counters (2,) int64: node visits, pairs of points tested.
     """
-    nodes, at = np.empty((STACK, 2), np.int64), np.empty((STACK, 6))
-    lanes = np.empty((2, 3, LANES), np.float32)
+    nodes, lanes = np.empty((STACK, 2), np.int64), np.empty((2, 3, LANES), np.float32)
     own = np.zeros(2, np.int64)
     for number in range(pairs.shape[0]):
         if stopped(stop):
@@ -281,7 +273,9 @@ def touch_pairs(a, b, poses, units, pairs, margin_units, origin, stop, verdict, 
         i, j = pairs[number, 0], pairs[number, 1]
         own[0] = 0
         own[1] = 0
+        one = PlacedBody(a, poses[i], minus(place_of(poses[i]), origin))
+        other = PlacedBody(b, poses[j], minus(place_of(poses[j]), origin))
         reach = units[i] + units[j] + margin_units
-        verdict[number] = touch_bodies(a, poses[i], b, poses[j], reach, origin, stop, nodes, at, lanes, own)
+        verdict[number] = _touch_bodies(one, other, reach, stop, nodes, lanes, own)
         counters[0] += own[0]
         counters[1] += own[1]

@@ -17,32 +17,158 @@ within 1.2 units (18 nm) of contact. All arithmetic is float64: avatars have som
 few of which are near one another.
 """
 
-import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import largest_term, place, to_units
+from ..core.node_bounds import STACK
+from ..core.placed_avatar import Avatar, largest_term, place
+from ..core.reach import INFINITE
 from ..core.scene_arrays import LANES, stopped
-from ..motion.contact_times import INFINITE, pair_times
-from ..motion.screw_motion import make_motion, pose_at
-from .moving_bodies import (
-    BodyChord,
-    BodySweep,
-    least_square,
-    place_moving,
-    place_moving_nodes,
-    place_standing,
-    place_standing_nodes,
-)
+from ..motion.moving_avatar import least_square
+from ..motion.screw_motion import ScrewMotion, make_motion, pose_at
+from ..motion.sweep_interval import LEAST_SAGITTA, pair_times
+from ..motion.sweep_segments import CHORD_BEND, MAX_REFUSED, longest_part
+from ..motion.vectors import dot, minus, place_of, placed, plus, point_of, put, times, vector
+from .body_pairs import STRETCH, PlacedBody
 
-# As in sweep_interval.py and sweep_advance.py: the sagitta below which halving is useless; the
-# sagitta of a first chord, in avatar sizes; the number of advances that may settle nothing.
-_LEAST_SAGITTA = 0.25
-_CHORD_BEND = 1.0 / 16.0
-_MAX_REFUSED = 512
+
+class BodyScratch(NamedTuple):
+    """Scratch of one thread, for avatars of limited size; see `make_body_scratch`.
+
+    stack: (s, 2) int64, pairs of nodes still to examine.
+    moving: (8, nodes): a node's centre at the beginning, its displacement, 1 / its square, its
+    radius.
+    paths: (blocks, 7, LANES), the same of points, without a radius.
+    standing: (4, nodes), centres and radii.  lanes: (blocks, 3, LANES), points.
+    stamps: (2, blocks) int64: the chord and the body that a block was placed for.
+    turns: (2,) int64, chords and bodies so far.
+    keep: (LANES,).
+    ends: (2, 4, 4), shifts: (2, 3): the poses of a chord's ends and their translations.
+    first: (2,), when the first contact is possible, and when a contact is certain.
+    pair: (4,) int64, block and lane of either point.
+    counters: (2,), node visits, point tests.
+    """
+
+    stack: NDArray[np.int64]
+    moving: NDArray[np.float64]
+    paths: NDArray[np.float64]
+    standing: NDArray[np.float64]
+    lanes: NDArray[np.float64]
+    stamps: NDArray[np.int64]
+    turns: NDArray[np.int64]
+    keep: NDArray[np.bool_]
+    ends: NDArray[np.float64]
+    shifts: NDArray[np.float64]
+    first: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    counters: NDArray[np.int64]
+
+
+def make_body_scratch(nodes: int, blocks: int) -> BodyScratch:
+    """Allocate scratch for `sweep_bodies`.
+
+    nodes, blocks: the most that an avatar has.
+    """
+    return BodyScratch(
+        np.empty((STACK, 2), np.int64), np.empty((8, nodes)), np.empty((blocks, 7, LANES)), np.empty((4, nodes)),
+        np.empty((blocks, 3, LANES)), np.full((2, blocks), -1, np.int64), np.zeros(2, np.int64),
+        np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty((2, 3)), np.empty(2),
+        np.zeros(4, np.int64), np.zeros(2, np.int64),
+    )  # fmt: skip
+
+
+class BodySweep(NamedTuple):
+    """One motion against one body.
+
+    motion: ScrewMotion of a.  b: the standing body.  units: both radii plus the margin.
+    error: of a distance of two placed centres, and of their rounding to units [m].
+    stop: (1,) int64, a stop flag.
+    """
+
+    motion: ScrewMotion
+    a: Avatar
+    b: PlacedBody
+    units: np.int64
+    error: float
+    scratch: BodyScratch
+    stop: NDArray[np.int64]
+
+
+class BodyChord(NamedTuple):
+    """Straight approximation of a motion over one interval from t0 on (body_sweep.py).
+
+    inner, outer: U - band, U + band, exact units, where U is `BodySweep.units`.  threshold: outer
+    with the error [m].
+    final: whether halving the interval is useless.
+    """
+
+    t0: float
+    inner: float
+    outer: float
+    threshold: float
+    final: bool
+
+
+@njit_no_refcount
+def _inverse_square(x, y, z):
+    """Return 1 / (x^2 + y^2 + z^2), or 0 where the sum is too small to divide by."""
+    square = x * x + y * y + z * z
+    return 1.0 / square if square > 1e-200 else 0.0
+
+
+@njit_no_refcount
+def _place_moving(sweep, block):
+    """Place the points of a leaf node of the moving avatar at both ends of a chord."""
+    paths, ends, shifts = sweep.scratch.paths, sweep.scratch.ends, sweep.scratch.shifts
+    points = sweep.a.points
+    for r in range(3):
+        for k in range(LANES):
+            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
+            begin = place(ends[0], shifts[0], r, x, y, z)
+            paths[block, r, k] = begin
+            paths[block, 3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
+    for k in range(LANES):
+        paths[block, 6, k] = _inverse_square(paths[block, 3, k], paths[block, 4, k], paths[block, 5, k])
+
+
+@njit_no_refcount
+def _place_standing(sweep, block):
+    """Place the points of a leaf node of the standing avatar."""
+    lanes, body, points = sweep.scratch.lanes, sweep.b, sweep.b.avatar.points
+    for r in range(3):
+        for k in range(LANES):
+            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
+            lanes[block, r, k] = place(body.pose, body.shift, r, x, y, z)
+
+
+@njit_no_refcount
+def _place_moving_nodes(sweep, count):
+    """Place the first `count` nodes of the moving avatar at both ends of a chord."""
+    moving, ends, shifts = sweep.scratch.moving, sweep.scratch.ends, sweep.scratch.shifts
+    for i in range(count):
+        center = vector(sweep.a.center[i])
+        begin = placed(ends[0], shifts[0], center)
+        way = minus(placed(ends[1], shifts[1], center), begin)
+        for r in range(3):
+            moving[r, i], moving[3 + r, i] = begin[r], way[r]
+        moving[6, i] = _inverse_square(way[0], way[1], way[2])
+        moving[7, i] = sweep.a.radius[i] * STRETCH
+
+
+@njit_no_refcount
+def _place_standing_nodes(sweep):
+    """Place the nodes of the standing avatar."""
+    standing, body, b = sweep.scratch.standing, sweep.b, sweep.b.avatar
+    for j in range(b.center.shape[0]):
+        center = placed(body.pose, body.shift, b.center[j])
+        for r in range(3):
+            standing[r, j] = center[r]
+        standing[3, j] = b.radius[j] * STRETCH
 
 
 @njit_no_refcount
@@ -52,43 +178,24 @@ def _latest(scratch):
 
 
 @njit_no_refcount
-def _separates(sweep, chord, x, y, z, block_b, lane_b):
-    """Return whether a pair within the band at the start does not touch there and comes no nearer.
-
-    x, y, z: the moving point.  block_b, lane_b: the standing point.
-    """
-    scratch = sweep.scratch
-    gap, displacement = scratch.gap, scratch.displacement
-    if chord.t0 > 0.0 or not chord.final:
-        return False
-    if gap[0] * displacement[0] + gap[1] * displacement[1] + gap[2] * displacement[2] < 0.0:
-        return False
-    square = np.int64(0)
-    for r in range(3):
-        begin = to_units(place(scratch.ends[0], scratch.shifts[0], r, x, y, z))
-        difference = begin - to_units(scratch.lanes[block_b, r, lane_b])
-        square += difference * difference
-    return square > sweep.units * sweep.units
-
-
-@njit_no_refcount
 def _try_pair(sweep, chord, block_a, lane_a, block_b, lane_b):
     """Update scratch.first with one pair of points; lanes are those of block_b."""
-    scratch, points = sweep.scratch, sweep.a.points
-    gap, displacement, ends, first = scratch.gap, scratch.displacement, scratch.ends, scratch.first
-    x, y, z = points[block_a, 0, lane_a], points[block_a, 1, lane_a], points[block_a, 2, lane_a]
-    for r in range(3):
-        begin = place(ends[0], scratch.shifts[0], r, x, y, z) * UNITS_PER_METRE
-        end = place(ends[1], scratch.shifts[1], r, x, y, z) * UNITS_PER_METRE
-        gap[r] = begin - np.float64(to_units(scratch.lanes[block_b, r, lane_b]))
-        displacement[r] = end - begin
+    scratch, first = sweep.scratch, sweep.scratch.first
+    ends, shifts, point = scratch.ends, scratch.shifts, point_of(sweep.a.points, block_a, lane_a)
+    begin = times(UNITS_PER_METRE, placed(ends[0], shifts[0], point))
+    end = times(UNITS_PER_METRE, placed(ends[1], shifts[1], point))
+    x, y, z = times(UNITS_PER_METRE, point_of(scratch.lanes, block_b, lane_b))
+    standing = np.rint(x), np.rint(y), np.rint(z)
+    gap, displacement = minus(begin, standing), minus(end, begin)
     earliest_possible, earliest_certain, _ = pair_times(gap, displacement, chord.inner, chord.outer)
-    if (
-        earliest_possible == 0.0
-        and earliest_certain > 0.0
-        and _separates(sweep, chord, x, y, z, block_b, lane_b)
-    ):
-        return
+    if earliest_possible == 0.0 and earliest_certain > 0.0 and chord.t0 == 0.0 and chord.final:
+        # A pair within the band at the start that does not touch there and comes no nearer does not count.
+        square = np.int64(0)
+        for r in range(3):
+            difference = np.int64(np.rint(begin[r])) - np.int64(standing[r])
+            square += difference * difference
+        if dot(gap, displacement) >= 0.0 and square > sweep.units * sweep.units:
+            return
     if earliest_possible < first[0]:
         first[0] = earliest_possible
         pair = scratch.pair
@@ -144,12 +251,12 @@ def _leaves(sweep, chord, i, j):
     """
     scratch = sweep.scratch
     lanes, paths, stamps, turns = scratch.lanes, scratch.paths, scratch.stamps, scratch.turns
-    block_a, block_b = ~sweep.a.first[i], ~sweep.b.first[j]
+    block_a, block_b = ~sweep.a.first[i], ~sweep.b.avatar.first[j]
     if stamps[0, block_a] != turns[0]:
-        place_moving(sweep, block_a)
+        _place_moving(sweep, block_a)
         stamps[0, block_a] = turns[0]
     if stamps[1, block_b] != turns[1]:
-        place_standing(sweep, block_b)
+        _place_standing(sweep, block_b)
         stamps[1, block_b] = turns[1]
     _mark_near(scratch, block_a, block_b, j, chord.threshold)
     far, latest = chord.threshold * chord.threshold * (1.0 + 1e-12), _latest(scratch)
@@ -166,7 +273,7 @@ def _leaves(sweep, chord, i, j):
             touched |= least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
         if not touched:
             continue
-        for k in range(sweep.b.count[j]):
+        for k in range(sweep.b.avatar.count[j]):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
             if least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
                 _try_pair(sweep, chord, block_a, lane, block_b, k)
@@ -195,15 +302,15 @@ def _descend(sweep, chord):
     The larger inner node is opened, a leaf never is. Among children, the pair whose centres come
     nearest is visited first: early contacts are then found early, and prune.
     """
-    scratch, a, b = sweep.scratch, sweep.a, sweep.b
+    scratch, a, b = sweep.scratch, sweep.a, sweep.b.avatar
     stack, counters = scratch.stack, scratch.counters
     scratch.turns[0] += 1
     scratch.first[0], scratch.first[1] = INFINITE, INFINITE
     counters[0] += 1
-    place_moving_nodes(sweep, 1)
+    _place_moving_nodes(sweep, 1)
     if _nearest(scratch, chord.threshold, 0, 0) == INFINITE:
         return
-    place_moving_nodes(sweep, a.center.shape[0])
+    _place_moving_nodes(sweep, a.center.shape[0])
     stack[0, 0], stack[0, 1] = 0, 0
     depth = 1
     while depth > 0 and not stopped(sweep.stop):
@@ -247,15 +354,15 @@ def _search(sweep, t0, t1):
     ends, shifts = scratch.ends, scratch.shifts
     pose_at(motion, t0, ends[0])
     pose_at(motion, t1, ends[1])
-    for r in range(3):
-        shifts[0, r], shifts[1, r] = ends[0, r, 3], ends[1, r, 3]
+    put(shifts[0], place_of(ends[0]))
+    put(shifts[1], place_of(ends[1]))
     sagitta = motion.bend * (t1 - t0) * (t1 - t0) / 8.0 * UNITS_PER_METRE
     # The standing point is an integer, except far out where float64 cannot represent it; `error`
     # covers that.
     loose = (2.0 * motion.slip + sweep.error) * UNITS_PER_METRE
     band = (0.8661 + sagitta + loose) * (1.0 + 1e-9)
     outer = np.float64(sweep.units) + band
-    final = sagitta <= _LEAST_SAGITTA
+    final = sagitta <= LEAST_SAGITTA
     threshold = outer / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE + 8.0 * sweep.error
     _descend(sweep, BodyChord(t0, np.float64(sweep.units) - band, outer, threshold, final))
     return final
@@ -268,9 +375,7 @@ def _advance(sweep, size, until, tolerance):
     scratch.pair is then the pair that touches first.
     """
     motion, first = sweep.motion, sweep.scratch.first
-    longest = 1.0
-    if motion.bend > 8.0 * _CHORD_BEND * size:
-        longest = math.sqrt(8.0 * _CHORD_BEND * size / motion.bend)
+    longest = longest_part(motion, INFINITE, CHORD_BEND * size)
     t, length, refused = 0.0, longest, 0
     while True:
         after = until if t + length >= until else t + length
@@ -285,7 +390,7 @@ def _advance(sweep, size, until, tolerance):
         since = max(t, t + first[0] * (after - t) - 2.0**-52)
         sure = t + first[1] * (after - t) if first[1] <= 1.0 else INFINITE
         refused += 1
-        if final or refused > _MAX_REFUSED or motion.speed * (sure - since) <= tolerance:
+        if final or refused > MAX_REFUSED or motion.speed * (sure - since) <= tolerance:
             return since
         length = max(min(sure - since, 0.25 * (after - t)), 2.0**-52)
         t = since
@@ -309,31 +414,25 @@ def sweep_bodies(
     [m]; named (2,) int64: block and lane of the body's point. Adds to scratch.counters.
     """
     motion = make_motion(first, last, box, np.zeros(3))
-    shift, shifts = np.empty(3), scratch.shifts
     pose = np.empty((4, 4))
-    size = 1e-6
-    for r in range(3):
-        shift[r] = 0.0
-        size += abs(box[1, r] - box[0, r])
-    largest_a = a.radius[0]
-    for end in (first, last):
-        for r in range(3):
-            shift[r] = end[r, 3]
-        term = largest_term(end, shift, a.center[0, 0], a.center[0, 1], a.center[0, 2])
-        largest_a = max(largest_a, term + a.radius[0])
+    extent, root, other = minus(box[1], box[0]), vector(a.center[0]), vector(b.center[0])
+    size = 1e-6 + abs(extent[0]) + abs(extent[1]) + abs(extent[2])
+    largest_a = max(
+        largest_term(first, place_of(first), root[0], root[1], root[2]),
+        largest_term(last, place_of(last), root[0], root[1], root[2]),
+    )
+    largest_a += a.radius[0]
     best, found = -1, until
     for at in range(rows.shape[0]):
         if stopped(stop):
             break
         row = rows[at]
-        for r in range(3):
-            shifts[2, r] = poses[row, r, 3] - origin[r]
-        largest = largest_term(poses[row], shifts[2], b.center[0, 0], b.center[0, 1], b.center[0, 2])
-        error = max(largest_a, largest + b.radius[0]) * 2.0**-49
-        units = np.int64(units_a + units_b + margin_units)
-        sweep = BodySweep(motion, a, b, poses[row], units, error, scratch, stop)
+        body = PlacedBody(b, poses[row], minus(place_of(poses[row]), origin))
+        largest = largest_term(body.pose, body.shift, other[0], other[1], other[2]) + b.radius[0]
+        units, error = np.int64(units_a + units_b + margin_units), max(largest_a, largest) * 2.0**-49
+        sweep = BodySweep(motion, a, body, units, error, scratch, stop)
         scratch.turns[1] += 1
-        place_standing_nodes(sweep, b.center.shape[0])
+        _place_standing_nodes(sweep)
         since = _advance(sweep, size, min(found, 1.0), tolerance)
         if since >= found or since == INFINITE:
             continue
@@ -341,12 +440,7 @@ def sweep_bodies(
         pair = scratch.pair
         named[0], named[1] = pair[2], pair[3]
         pose_at(motion, since, pose)
-        for r in range(3):
-            shift[r] = pose[r, 3]
-        for r in range(3):
-            p, q = a.points, b.points
-            x, y, z = p[pair[0], 0, pair[1]], p[pair[0], 1, pair[1]], p[pair[0], 2, pair[1]]
-            witness[0, r] = place(pose, shift, r, x, y, z) + origin[r]
-            x, y, z = q[pair[2], 0, pair[3]], q[pair[2], 1, pair[3]], q[pair[2], 2, pair[3]]
-            witness[1, r] = place(poses[row], shifts[2], r, x, y, z) + origin[r]
+        own, there = point_of(a.points, pair[0], pair[1]), point_of(b.points, pair[2], pair[3])
+        put(witness[0], plus(placed(pose, place_of(pose), own), origin))
+        put(witness[1], plus(placed(body.pose, body.shift, there), origin))
     return best, found

@@ -1,7 +1,9 @@
-"""Motions that begin in contact: which scan points an avatar holds, and the planes it may not cross.
+"""Points of an avatar and of the scan around a contact. Motions that begin in contact: which scan points
+an avatar holds, and the planes it may not cross. Contacts of a walk: the patch of the avatar's surface
+around the touched point (`lowest_heights`).
 
 The rule, its proof and its limits are in schemas/SCENE.md, "A user in contact". Sums are float64 in
-a fixed order, so that every machine finds the same motions; distances below `SLACK` count as
+a fixed order, so that every machine finds the same motions and heights; distances below `SLACK` count as
 contact.
 """
 
@@ -13,9 +15,22 @@ import numpy as np
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_bounds import STACK
-from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
+from ..core.normal_codes import NO_NORMAL, SUMS, add_sums, decode_normal, normal_code
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class
-from .avatar_patch import add_difference
+from ..motion.sweep_interval import scan_point
+from ..motion.vectors import (
+    divided,
+    dot,
+    minus,
+    norm,
+    place_of,
+    plus,
+    point_of,
+    put,
+    rotate_back,
+    times,
+    vector,
+)
 
 # More than float64 loses at 10^7 m from the origin, and less than any skin [m].
 SLACK = 1e-7
@@ -37,6 +52,11 @@ MIN_GAP = 0.25
 MAX_PLANES = 256
 # The points up to this far beyond a plane [m] are of its surface.
 THICK = 0.05
+# Steps per metre of the differences that are summed for a normal: with a reach of a metre, the sums
+# over eight million points fit 63 bits.
+PATCH_STEPS = 1 << 20
+# A node farther than the reach by this share has no point in reach, whatever was rounded.
+_ROUNDED = 1.0 + 1e-9
 # Directions (290, 3) of the half-spaces around the avatar: whole numbers up to 3, the shortest first.
 # Any direction is at most 9 degrees from one of them, so that the hull is a hundredth too large. Rows
 # r and 5 - r are the axis r, against it and along it: they rule out most points.
@@ -56,13 +76,8 @@ def gather_points(held, voxel, box, pose, found, count):
     box: (2, 3) int64, inclusive, lattice.  pose: (4, 4), avatar to archive.  count: number of
     points so far. Points beyond the capacity are counted and not written.
     """
-    scene = held.scene
-    words, ints, halves = scene.words, scene.ints, scene.halves
-    mask = np.uint64(scene.radius_deficit.shape[0] - 1)
-    low, shift = np.empty(3, np.int64), np.empty(3)
-    for r in range(3):
-        low[r] = scene.corners[voxel, r]
-        shift[r] = scene.origin[r] - pose[r, 3]
+    scene, shift = held.scene, minus(held.scene.origin, place_of(pose))
+    words, ints, mask = scene.words, scene.ints, np.uint64(scene.radius_deficit.shape[0] - 1)
     base = scene.where[voxel, 0]
     rows, depth = np.empty(STACK, np.int64), 1
     rows[0] = base
@@ -70,7 +85,7 @@ def gather_points(held, voxel, box, pose, found, count):
         depth -= 1
         row, near = rows[depth], True
         for r in range(3):
-            middle, radius = low[r] + np.float64(words[row + r]), np.float64(words[row + 3])
+            middle, radius = scene.corners[voxel, r] + np.float64(words[row + r]), np.float64(words[row + 3])
             near &= middle + radius >= box[0, r] and middle - radius <= box[1, r]
         if not near:
             continue
@@ -83,53 +98,41 @@ def gather_points(held, voxel, box, pose, found, count):
         block_at = scene.where[voxel, 1] + ~first * scene.block_words
         lane_at = scene.where[voxel, 2] + ~first * 3 * LANES
         for j in range(points):
-            x = low[0] + ints[block_at] + np.int64(halves[lane_at + j])
-            y = low[1] + ints[block_at + 1] + np.int64(halves[lane_at + LANES + j])
-            z = low[2] + ints[block_at + 2] + np.int64(halves[lane_at + 2 * LANES + j])
-            if (
-                x < box[0, 0]
-                or x > box[1, 0]
-                or y < box[0, 1]
-                or y > box[1, 1]
-                or z < box[0, 2]
-                or z > box[1, 2]
-            ):
+            steps, inside = scan_point(scene, voxel, lane_at, block_at, j), True
+            for r in range(3):
+                inside &= box[0, r] <= steps[r] <= box[1, r]
+            if not inside:
                 continue
             if count < found.shape[0]:
                 to = found[count]
-                a, b, c = x * scene.step + shift[0], y * scene.step + shift[1], z * scene.step + shift[2]
-                for k in range(3):
-                    to[PLACE + k] = pose[0, k] * a + pose[1, k] * b + pose[2, k] * c
-                to[LATTICE], to[LATTICE + 1], to[LATTICE + 2] = x, y, z
+                put(to[PLACE:], rotate_back(pose, plus(times(scene.step, steps), shift)))
+                put(to[LATTICE:], steps)
                 to[DEFICIT] = scene.radius_deficit[point_class(ints, block_at, j, mask)]
             count += 1
     return count
 
 
 @nb.njit(nogil=True, cache=True)
-def meet_points(body, box, points, reach, skipped, planes, way, times, own):
+def meet_points(body, box, points, reach, skipped, planes, way, met, own):
     """Find when a translated avatar first meets each of some points.
 
     body: reference to the avatar's arrays.  box: (2, 3) of its centres.
     points: (n, 3) places in its frame [m].  reach: (n,) contact distance of each [m].
     skipped: (n,) bool, points to leave out.  planes: (k, PLANE); points up to THICK beyond one of
     them are left out.  way: (3,) the translation, avatar frame.
-    times: (n,), set to the fraction of `way` at the first contact; inf if there is none, or if left
+    met: (n,), set to the fraction of `way` at the first contact; inf if there is none, or if left
     out.  own: (n, 3), set to the centre that touches first, in the avatar's frame.
     """
-    avatar = body.avatar
-    square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
-    rows = np.empty(STACK, np.int64)
+    avatar, square, rows = body.avatar, dot(way, way), np.empty(STACK, np.int64)
     for i in range(points.shape[0]):
-        times[i] = np.inf
-        x, y, z, most = points[i, 0], points[i, 1], points[i, 2], reach[i] + SLACK
-        left_out = skipped[i]
+        met[i], left_out = np.inf, skipped[i]
+        point, most = vector(points[i]), reach[i] + SLACK
         for r in range(3):
             low, high = box[0, r] + min(way[r], 0.0), box[1, r] + max(way[r], 0.0)
-            left_out |= points[i, r] < low - most - SLACK or points[i, r] > high + most + SLACK
+            left_out |= point[r] < low - most - SLACK or point[r] > high + most + SLACK
         if not left_out:
-            for k in range(planes.shape[0]):
-                beyond = (planes[k, 0] * x + planes[k, 1] * y) + planes[k, 2] * z - planes[k, OFFSET]
+            for plane in planes:
+                beyond = dot(plane, point) - plane[OFFSET]
                 left_out |= beyond >= 0.0 and beyond <= THICK
         if left_out:
             continue
@@ -137,13 +140,12 @@ def meet_points(body, box, points, reach, skipped, planes, way, times, own):
         while depth > 0:
             depth -= 1
             row = rows[depth]
-            dx, dy, dz = x - avatar.center[row, 0], y - avatar.center[row, 1], z - avatar.center[row, 2]
-            t = 0.0
+            gap, t = minus(point, avatar.center[row]), 0.0
             if square > 0.0:
-                t = min(max((dx * way[0] + dy * way[1] + dz * way[2]) / square, 0.0), 1.0)
-            dx, dy, dz = dx - t * way[0], dy - t * way[1], dz - t * way[2]
-            both = (most + avatar.radius[row]) * (1.0 + 1e-9)
-            if dx * dx + dy * dy + dz * dz > both * both:
+                t = min(max(dot(gap, way) / square, 0.0), 1.0)
+            gap = minus(gap, times(t, way))
+            both = (most + avatar.radius[row]) * _ROUNDED
+            if dot(gap, gap) > both * both:
                 continue
             first, count = np.int64(avatar.first[row]), np.int64(avatar.count[row])
             if first >= 0:
@@ -152,24 +154,20 @@ def meet_points(body, box, points, reach, skipped, planes, way, times, own):
                     depth += 1
                 continue
             for j in range(count):
-                ax, ay, az = (
-                    avatar.points[~first, 0, j],
-                    avatar.points[~first, 1, j],
-                    avatar.points[~first, 2, j],
-                )
-                dx, dy, dz = x - ax, y - ay, z - az
-                beyond = dx * dx + dy * dy + dz * dz - most * most
+                centre = point_of(avatar.points, ~first, j)
+                gap = minus(point, centre)
+                beyond = dot(gap, gap) - most * most
                 time = np.inf
                 if beyond <= 0.0:
                     time = 0.0
                 else:
-                    along = dx * way[0] + dy * way[1] + dz * way[2]
+                    along = dot(gap, way)
                     root = along * along - square * beyond
                     if along > 0.0 and root >= 0.0 and along - math.sqrt(root) <= square:
                         time = max(0.0, (along - math.sqrt(root)) / square)
-                if time < times[i]:
-                    times[i] = time
-                    own[i, 0], own[i, 1], own[i, 2] = ax, ay, az
+                if time < met[i]:
+                    met[i] = time
+                    put(own[i], centre)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -179,17 +177,15 @@ def find_heights(body, directions, heights):
     The tree rules out all but some of the points: those of a filled person, 82,000, took 20 ms of the
     first frame in contact.
     """
-    avatar = body.avatar
-    rows = np.empty(STACK, np.int64)
+    avatar, rows = body.avatar, np.empty(STACK, np.int64)
     for n in range(directions.shape[0]):
-        a, b, c, most = directions[n, 0], directions[n, 1], directions[n, 2], -np.inf
-        length = math.sqrt((a * a + b * b) + c * c) * (1.0 + 1e-9)
+        direction, most = vector(directions[n]), -np.inf
+        length = norm(direction) * _ROUNDED
         rows[0], depth = 0, 1
         while depth > 0:
             depth -= 1
             row = rows[depth]
-            height = (a * avatar.center[row, 0] + b * avatar.center[row, 1]) + c * avatar.center[row, 2]
-            if height + length * avatar.radius[row] < most:
+            if dot(direction, avatar.center[row]) + length * avatar.radius[row] < most:
                 continue
             first, count = np.int64(avatar.first[row]), np.int64(avatar.count[row])
             if first >= 0:
@@ -198,12 +194,7 @@ def find_heights(body, directions, heights):
                     depth += 1
                 continue
             for j in range(count):
-                x, y, z = (
-                    avatar.points[~first, 0, j],
-                    avatar.points[~first, 1, j],
-                    avatar.points[~first, 2, j],
-                )
-                most = max(most, (a * x + b * y) + c * z)
+                most = max(most, dot(direction, point_of(avatar.points, ~first, j)))
         heights[n] = most
 
 
@@ -214,12 +205,13 @@ def find_held(directions, heights, points, reach, held):
     heights: of the avatar's centres along `directions` (h, 3), as `find_heights` writes them.
     points, reach: as for `meet_points`. A point in a hollow between spheres is inside too.
     """
-    lengths = np.sqrt((directions * directions).sum(axis=1))
+    lengths = np.empty(directions.shape[0])
+    for n in range(directions.shape[0]):
+        lengths[n] = norm(directions[n])
     for i in range(points.shape[0]):
-        x, y, z, inside = points[i, 0], points[i, 1], points[i, 2], True
+        point, inside = vector(points[i]), True
         for n in range(directions.shape[0]):
-            height = (directions[n, 0] * x + directions[n, 1] * y) + directions[n, 2] * z
-            if height > heights[n] + reach[i] * lengths[n]:
+            if dot(directions[n], point) > heights[n] + reach[i] * lengths[n]:
                 inside = False
                 break
         held[i] |= inside
@@ -246,6 +238,13 @@ def _core(box, ends):
     ends[1, longest] += half
 
 
+@njit_no_refcount
+def _add_difference(gap, sums):
+    """Add a point's difference to another one [m] to the sums for `normal_code`."""
+    x, y, z = times(PATCH_STEPS, gap)
+    add_sums(sums, np.int64(np.rint(x)), np.int64(np.rint(y)), np.int64(np.rint(z)))
+
+
 @nb.njit(nogil=True, cache=True)
 def _surface(points, which, at, reach):
     """Return the code of the normal of points (n, 3) near the one of row `at`.
@@ -256,9 +255,9 @@ def _surface(points, which, at, reach):
     for i in range(points.shape[0]):
         if not which[i]:
             continue
-        x, y, z = points[i, 0] - points[at, 0], points[i, 1] - points[at, 1], points[i, 2] - points[at, 2]
-        if x * x + y * y + z * z <= reach * reach:
-            add_difference(x, y, z, sums)
+        gap = minus(points[i], points[at])
+        if dot(gap, gap) <= reach * reach:
+            _add_difference(gap, sums)
     return normal_code(sums)
 
 
@@ -273,21 +272,16 @@ def separate_core(box, points, planes):
     Returns -1 if the core touches a point, or there are more planes.
     """
     ends, left, distances = np.empty((2, 3)), np.ones(points.shape[0], np.bool_), np.empty(points.shape[0])
-    core, normal, heights = np.empty((points.shape[0], 3)), np.empty(3), np.empty(points.shape[0])
-    toward, beyond = np.empty(3), np.empty(points.shape[0], np.bool_)
+    core, heights = np.empty((points.shape[0], 3)), np.empty(points.shape[0])
+    beyond = np.empty(points.shape[0], np.bool_)
     _core(box, ends)
-    length = 0.0
-    for r in range(3):
-        length += (ends[1, r] - ends[0, r]) ** 2
+    span = minus(ends[1], ends[0])
+    length = dot(span, span)
     for i in range(points.shape[0]):
-        along, square = 0.0, 0.0
-        for r in range(3):
-            along += (points[i, r] - ends[0, r]) * (ends[1, r] - ends[0, r])
+        along = dot(minus(points[i], ends[0]), span)
         along = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
-        for r in range(3):
-            core[i, r] = ends[0, r] + along * (ends[1, r] - ends[0, r])
-            square += (points[i, r] - core[i, r]) ** 2
-        distances[i] = math.sqrt(square)
+        put(core[i], plus(ends[0], times(along, span)))
+        distances[i] = norm(minus(points[i], core[i]))
     count = 0
     while True:
         at = -1
@@ -299,25 +293,21 @@ def separate_core(box, points, planes):
         if distances[at] <= SLACK or count == MAX_PLANES:
             return -1
         best, most = planes[count], 0
-        for r in range(3):
-            best[NEAREST + r], best[CORE + r] = points[at, r], core[at, r]
-            toward[r] = (points[at, r] - core[at, r]) / distances[at]
+        put(best[NEAREST:], points[at])
+        put(best[CORE:], core[at])
+        toward = divided(minus(points[at], core[at]), distances[at])
         for level in range(-1, len(REACHES)):
-            for r in range(3):
-                normal[r] = toward[r]
+            normal = toward
             if level >= 0:
                 code = _surface(points, beyond if level == len(REACHES) - 1 else left, at, REACHES[level])
                 if code == NO_NORMAL:
                     continue
-                a, b, c = decode_normal(code)
-                side = -1.0 if (a * toward[0] + b * toward[1]) + c * toward[2] < 0.0 else 1.0
-                normal[0], normal[1], normal[2] = side * a, side * b, side * c
-            gap = np.inf
+                normal = decode_normal(code)
+                if dot(normal, toward) < 0.0:
+                    normal = times(-1.0, normal)
             for i in range(points.shape[0]):
-                heights[i] = (normal[0] * points[i, 0] + normal[1] * points[i, 1]) + normal[2] * points[i, 2]
-            for end in range(2):
-                own = (normal[0] * ends[end, 0] + normal[1] * ends[end, 1]) + normal[2] * ends[end, 2]
-                gap = min(gap, heights[at] - own)
+                heights[i] = dot(normal, points[i])
+            gap = heights[at] - max(dot(normal, ends[0]), dot(normal, ends[1]))
             if level >= 0 and gap < MIN_GAP * distances[at]:
                 continue
             least, offset, found = heights[at] - min(MAX_BUMP, 0.5 * gap), heights[at], 0
@@ -327,10 +317,46 @@ def separate_core(box, points, planes):
                     found += 1
             if found > most:
                 most, best[OFFSET] = found, offset
-                for r in range(3):
-                    best[NORMAL + r] = normal[r]
+                put(best[NORMAL:], normal)
                 for i in range(points.shape[0]):
                     beyond[i] = left[i] and heights[i] >= offset
         for i in range(points.shape[0]):
             left[i] &= not beyond[i]
         count += 1
+
+
+@nb.njit(nogil=True, cache=True)
+def lowest_heights(body, point, reach, directions, heights, sums):
+    """Find how low the points of an avatar's surface near one of them lie along directions.
+
+    body: reference to the avatar's arrays.
+    point: (3,) a place on the surface, avatar frame [m].  reach: inclusive [m].
+    directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
+    within reach, relative to `point` [m]; 0 if there are none.
+    sums: (SUMS,) int64, set to the sums for `normal_code` (kernels/core/normal_codes.py), in
+    1 / PATCH_STEPS of a metre.
+    """
+    avatar = body.avatar
+    rows = np.empty(STACK, np.int64)
+    heights[:] = 0.0
+    sums[:] = 0
+    rows[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        row = rows[depth]
+        gap, both = minus(avatar.center[row], point), (reach + avatar.radius[row]) * _ROUNDED
+        if dot(gap, gap) > both * both:
+            continue
+        first, count = np.int64(avatar.first[row]), np.int64(avatar.count[row])
+        if first >= 0:
+            for child in range(first, first + count):
+                rows[depth] = child
+                depth += 1
+            continue
+        for j in range(count):
+            gap = minus(point_of(avatar.points, ~first, j), point)
+            if dot(gap, gap) > reach * reach or body.rows[~first, j] >= body.surface:
+                continue
+            for k in range(directions.shape[0]):
+                heights[k] = min(heights[k], dot(gap, directions[k]))
+            _add_difference(gap, sums)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RADIUS_CLASSES
 from ....schemas.runtime import compiling as nb
-from ..core.kernel_decorators import njit_no_refcount
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_bounds import STACK
 from ..core.placed_avatar import Avatar, largest_term, place
 from ..core.scene_arrays import LANES, SceneArrays
@@ -51,7 +51,7 @@ class MovingAvatar(NamedTuple):
     `ClassThresholds`, a motion of the walk took a quarter longer.
     counters: (5,) int64, node visits, point tests, chords placed, orientations placed, and 1 while
     the chord is a translation.
-    gap, displacement, keep, off, stack: scratch.
+    keep, off, stack: scratch.
     """
 
     nodes: NDArray[np.float32]
@@ -73,8 +73,6 @@ class MovingAvatar(NamedTuple):
     first: NDArray[np.float64]
     thresholds: NDArray[np.float32]
     counters: NDArray[np.int64]
-    gap: NDArray[np.float64]
-    displacement: NDArray[np.float64]
     keep: NDArray[np.bool_]
     off: NDArray[np.float32]
     stack: NDArray[np.int64]
@@ -115,31 +113,25 @@ def make_moving(avatar):
     """Allocate scratch for one avatar, not empty. It may serve any number of motions, one at a time."""
     nodes, blocks = avatar.center.shape[0], avatar.points.shape[0]
     return MovingAvatar(
-        np.empty((8, nodes), np.float32),
-        np.empty((blocks, 3, LANES), np.float32),
-        np.empty((blocks, 4, LANES), np.float32),
-        np.full(blocks, -1, np.int64),
-        np.empty(3, np.int64),
-        np.empty((3, nodes), np.float32),
-        np.empty((blocks, 3, LANES), np.float32),
-        np.full(10, np.nan),
-        np.zeros(blocks, np.int64),
-        np.empty(7, np.float32),
-        np.empty((2, 4, 4)),
-        np.empty((2, 3)),
-        np.empty((4, 4)),
-        np.empty(3),
-        np.zeros(6, np.int64),
-        np.zeros(6, np.int64),
-        np.empty(3),
-        np.empty((2, RADIUS_CLASSES), np.float32),
-        np.zeros(5, np.int64),
-        np.empty(3),
-        np.empty(3),
-        np.empty(LANES, np.bool_),
-        np.empty(3, np.float32),
-        np.empty((STACK, 2), np.int64),
-    )
+        np.empty((8, nodes), np.float32), np.empty((blocks, 3, LANES), np.float32),
+        np.empty((blocks, 4, LANES), np.float32), np.full(blocks, -1, np.int64), np.empty(3, np.int64),
+        np.empty((3, nodes), np.float32), np.empty((blocks, 3, LANES), np.float32), np.full(10, np.nan),
+        np.zeros(blocks, np.int64), np.empty(7, np.float32), np.empty((2, 4, 4)), np.empty((2, 3)), np.empty((4, 4)),
+        np.empty(3), np.zeros(6, np.int64), np.zeros(6, np.int64), np.empty(3),
+        np.empty((2, RADIUS_CLASSES), np.float32), np.zeros(5, np.int64), np.empty(LANES, np.bool_),
+        np.empty(3, np.float32), np.empty((STACK, 2), np.int64),
+    )  # fmt: skip
+
+
+@njit_inlined
+def least_square(x, y, z, dx, dy, dz, inverse, latest):
+    """Return the least square of a vector that moves from (x, y, z) by up to `latest` times (dx, dy, dz).
+
+    All of one type, float32 or float64. inverse: 1 / the square of (dx, dy, dz).
+    """
+    t = min(max(-(x * dx + y * dy + z * dz) * inverse, ZERO), latest)
+    ex, ey, ez = x + t * dx, y + t * dy, z + t * dz
+    return ex * ex + ey * ey + ez * ez
 
 
 @njit_no_refcount

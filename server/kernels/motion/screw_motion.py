@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
+from .vectors import Vector, column, cross, divided, dot, minus, norm, place_of, plus, rotate, times
 
 # Coefficients of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2, the omitted
 # terms are below 2^-58.
@@ -41,8 +42,8 @@ _NO_TURN = 1e-30
 class ScrewMotion(NamedTuple):
     """One motion.
 
-    first, last: (4, 4) poses.  axis: (3,) unit u.  half: A / 2, in [0, pi/2].  sine: sin(A / 2).
-    along, across: (3,) parts of the translation [m].  strain: (3, 3) F.
+    first, last: (4, 4) poses.  axis: unit u.  half: A / 2, in [0, pi/2].  sine: sin(A / 2).
+    along, across: parts of the translation [m].  strain: columns of F.
     The rates hold for every avatar point on the whole way of the ideal motion, per unit of t:
     speed: upper bound of the speed [m].  bend: upper bound of |second derivative| [m].
     slip: upper bound of the distance of a computed placed point from the ideal motion [m].
@@ -50,12 +51,12 @@ class ScrewMotion(NamedTuple):
 
     first: NDArray[np.float64]
     last: NDArray[np.float64]
-    axis: NDArray[np.float64]
+    axis: Vector
     half: float
     sine: float
-    along: NDArray[np.float64]
-    across: NDArray[np.float64]
-    strain: NDArray[np.float64]
+    along: Vector
+    across: Vector
+    strain: tuple[Vector, Vector, Vector]
     speed: float
     bend: float
     slip: float
@@ -90,12 +91,16 @@ def angle_of(s, c):
 
 
 @njit_no_refcount
-def _turn(axis, s, c, x, y, z):
-    """Return (x, y, z) rotated about `axis` by the angle whose HALF has sine s and cosine c."""
-    cx, cy, cz = axis[1] * z - axis[2] * y, axis[2] * x - axis[0] * z, axis[0] * y - axis[1] * x
-    dx, dy, dz = axis[1] * cz - axis[2] * cy, axis[2] * cx - axis[0] * cz, axis[0] * cy - axis[1] * cx
-    p, q = 2.0 * s * c, 2.0 * s * s
-    return x + (p * cx + q * dx), y + (p * cy + q * dy), z + (p * cz + q * dz)
+def _turn(axis, s, c, v):
+    """Return v rotated about `axis` by the angle whose HALF has sine s and cosine c."""
+    once = cross(axis, v)
+    return plus(v, plus(times(2.0 * s * c, once), times(2.0 * s * s, cross(axis, once))))
+
+
+@njit_no_refcount
+def _turn_back(axis, s, c, v):
+    """Return v, perpendicular to the axis, rotated back by the angle of sine s, cosine c."""
+    return minus(times(c, v), times(s, cross(axis, v)))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -144,47 +149,37 @@ def make_motion(first, last, box, origin):
     tests/unit/server/kernels/motion/test_screw_motion.py). The stated bound is twice that.
     """
     w, x, y, z = _quaternion(first, last)
-    sine = math.sqrt(x * x + y * y + z * z)
-    axis, half = np.zeros(3), 0.0
+    sine, axis, half = norm((x, y, z)), (1.0, 0.0, 0.0), 0.0
     if sine < _NO_TURN:
-        axis[0], sine = 1.0, 0.0
+        sine = 0.0
     else:
-        axis[0], axis[1], axis[2] = x / sine, y / sine, z / sine
-        half = angle_of(sine, w)
+        axis, half = divided((x, y, z), sine), angle_of(sine, w)
     sine, cosine = sine_cosine(half)
-    along, across, strain = np.empty(3), np.empty(3), np.empty((3, 3))
-    dot, moved = 0.0, 0.0
-    for r in range(3):
-        dot += axis[r] * (last[r, 3] - first[r, 3])
-    for r in range(3):
-        along[r] = dot * axis[r]
-        across[r] = (last[r, 3] - first[r, 3]) - along[r]
-        moved += abs(last[r, 3] - first[r, 3])
+    way = minus(place_of(last), place_of(first))
+    along = times(0.0 + dot(axis, way), axis)  # never times a negative zero
+    across = minus(way, along)
+    moved = abs(way[0]) + abs(way[1]) + abs(way[2])
+    strain = (
+        _strain(axis, sine, cosine, first, last, 0),
+        _strain(axis, sine, cosine, first, last, 1),
+        _strain(axis, sine, cosine, first, last, 2),
+    )
     uneven = 0.0
     for c in range(3):
-        back = _turn(axis, -sine, cosine, last[0, c], last[1, c], last[2, c])
         for r in range(3):
-            strain[r, c] = back[r] - first[r, c]
-            uneven += strain[r, c] * strain[r, c]
+            uneven += strain[c][r] * strain[c][r]
     uneven = math.sqrt(uneven)
     # p'(0) = along + (A / 2 sin(A/2)) E(-A/2) across, and p''(0) = A u x p'(0).
     rate = 1.0 if sine == 0.0 else half / sine
-    px, py, pz = _turn_back(axis, sine, cosine, across)
-    vx, vy, vz = along[0] + rate * px, along[1] + rate * py, along[2] + rate * pz
+    begin = plus(along, times(rate, _turn_back(axis, sine, cosine, across)))
     speed, bend, far = 0.0, 0.0, 0.0
     angle = 2.0 * half
     for corner in range(8):
-        cx, cy, cz = box[corner & 1, 0], box[corner >> 1 & 1, 1], box[corner >> 2, 2]
-        ox = first[0, 0] * cx + first[0, 1] * cy + first[0, 2] * cz
-        oy = first[1, 0] * cx + first[1, 1] * cy + first[1, 2] * cz
-        oz = first[2, 0] * cx + first[2, 1] * cy + first[2, 2] * cz
-        gx = vx + angle * (axis[1] * oz - axis[2] * oy)
-        gy = vy + angle * (axis[2] * ox - axis[0] * oz)
-        gz = vz + angle * (axis[0] * oy - axis[1] * ox)
-        speed = max(speed, math.sqrt(gx * gx + gy * gy + gz * gz))
-        hx, hy, hz = axis[1] * gz - axis[2] * gy, axis[2] * gx - axis[0] * gz, axis[0] * gy - axis[1] * gx
-        bend = max(bend, angle * math.sqrt(hx * hx + hy * hy + hz * hz))
-        far = max(far, abs(cx) + abs(cy) + abs(cz))
+        at = box[corner & 1, 0], box[corner >> 1 & 1, 1], box[corner >> 2, 2]
+        velocity = plus(begin, times(angle, cross(axis, rotate(first, at))))
+        speed = max(speed, norm(velocity))
+        bend = max(bend, angle * norm(cross(axis, velocity)))
+        far = max(far, abs(at[0]) + abs(at[1]) + abs(at[2]))
     largest, place = 0.0, 0.0
     for r in range(3):
         for c in range(3):
@@ -199,13 +194,9 @@ def make_motion(first, last, box, origin):
 
 
 @njit_no_refcount
-def _turn_back(axis, s, c, v):
-    """Return v (3,), perpendicular to the axis, rotated back by the angle of sine s, cosine c."""
-    return (
-        c * v[0] - s * (axis[1] * v[2] - axis[2] * v[1]),
-        c * v[1] - s * (axis[2] * v[0] - axis[0] * v[2]),
-        c * v[2] - s * (axis[0] * v[1] - axis[1] * v[0]),
-    )
+def _strain(axis, sine, cosine, first, last, c):
+    """Return a column of F."""
+    return minus(_turn(axis, -sine, cosine, column(last, c)), column(first, c))
 
 
 @njit_no_refcount
@@ -220,16 +211,13 @@ def pose_at(motion, t, pose):
     first, axis = motion.first, motion.axis
     s, c = sine_cosine(t * motion.half)
     for k in range(3):
-        x, y, z = (
-            first[0, k] + t * motion.strain[0, k],
-            first[1, k] + t * motion.strain[1, k],
-            first[2, k] + t * motion.strain[2, k],
-        )
-        pose[0, k], pose[1, k], pose[2, k] = _turn(axis, s, c, x, y, z)
+        strained = plus(column(first, k), times(t, motion.strain[k]))
+        pose[0, k], pose[1, k], pose[2, k] = _turn(axis, s, c, strained)
     ratio = t if motion.sine == 0.0 else s / motion.sine
     back_s, back_c = sine_cosine((1.0 - t) * motion.half)
     turned = _turn_back(axis, back_s, back_c, motion.across)
+    way = plus(times(t, motion.along), times(ratio, turned))
     for r in range(3):
-        pose[r, 3] = first[r, 3] + (t * motion.along[r] + ratio * turned[r])
+        pose[r, 3] = first[r, 3] + way[r]
         pose[3, r] = 0.0
     pose[3, 3] = 1.0

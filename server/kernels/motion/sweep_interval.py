@@ -36,6 +36,9 @@ At a moment, an interval of length 0, the search names the first of the pairs in
 NUMERICS.md N11. It visits nodes of lesser x first, and skips nodes whose points all follow. In a hall
 this takes 25 us more than a search that ends at the first contact (9 us), for a body of 8,000 points
 with 3,400 pairs in contact.
+
+The time of contact of one pair of points (`pair_times`) is float64 with a proof of its bounds;
+integers decide at the end.
 """
 
 import math
@@ -45,7 +48,8 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_bounds import ONE_SLACK, SLACK, has_box, make_thresholds
-from ..core.reach import HELD, state_of
+from ..core.placed_avatar import lattice_to_units, pair_square, to_units
+from ..core.reach import HELD, INFINITE, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -57,9 +61,9 @@ from ..core.scene_arrays import (
     point_class,
     stopped,
 )
-from .contact_times import INFINITE, scan_coordinate, try_pair
-from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
+from .moving_avatar import AvatarChord, least_square, place_block, place_nodes
 from .screw_motion import pose_at
+from .vectors import dot, minus, norm, place_of, placed, plus, point_of, put, times
 
 # Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
 # 0.87 to the band.
@@ -80,9 +84,7 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     wx, wy, wz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     span = radius + threshold
     both = words[at + U(3)] + span
-    t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-    ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-    if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
+    if least_square(wx, wy, wz, dx, dy, dz, inverse, latest) > both * both * ONE_SLACK:
         return False
     if has_box(words, row):
         # One branch on all sides costs less than six that are hard to predict.
@@ -132,9 +134,7 @@ def _leaves(sweep, chord, voxel, block, row):
     for j in range(LANES):
         dx, dy, dz = displacements[own, 0, j], displacements[own, 1, j], displacements[own, 2, j]
         wx, wy, wz = lanes[own, 0, j] - cx, lanes[own, 1, j] - cy, lanes[own, 2, j] - cz
-        t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[own, 3, j], ZERO), latest)
-        ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-        near = ex * ex + ey * ey + ez * ez <= square
+        near = least_square(wx, wy, wz, dx, dy, dz, displacements[own, 3, j], latest) <= square
         if boxed:
             ex, ey, ez = wx + latest * dx, wy + latest * dy, wz + latest * dz
             near &= (min(wx, ex) <= nx + wide) & (max(wx, ex) >= -nx - wide)
@@ -172,18 +172,14 @@ def _leaves(sweep, chord, voxel, block, row):
             wx = x - np.float32(halves[at_x + U(j)])
             wy = y - np.float32(halves[at_y + U(j)])
             wz = z - np.float32(halves[at_z + U(j)])
-            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-            touched |= ex * ex + ey * ey + ez * ez <= far
+            touched |= least_square(wx, wy, wz, dx, dy, dz, inverse, latest) <= far
         if not touched:
             continue
         for j in range(LANES):
             wx = x - np.float32(halves[at_x + U(j)])
             wy = y - np.float32(halves[at_y + U(j)])
             wz = z - np.float32(halves[at_z + U(j)])
-            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
-            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-            square = ex * ex + ey * ey + ez * ez
+            square = least_square(wx, wy, wz, dx, dy, dz, inverse, latest)
             if square <= far and square <= thresholds[1, point_class(ints, block_at, j, mask)]:
                 try_pair(sweep, chord, (block, lane, voxel, lane_at, block_at, j))
                 latest = _latest(moving)
@@ -201,17 +197,14 @@ def _least(words, row, r):
 def _follows(sweep, chord, voxel, a, row):
     """Return whether every pair of two nodes that touches follows moving.pair (NUMERICS.md N11)."""
     scene, moving = sweep.scene, sweep.moving
-    x = scan_coordinate(scene, moving.pair, 0)
+    x, y, z = pair_point(scene, found_pair(moving))
     # A scan point that touches the avatar's node is within its radius and the reach; 1: rounding.
     reach = np.float64(moving.nodes[3, a]) + chord.outer / scene.units_per_step + 1.0
     if np.float64(moving.nodes[0, a]) - reach > np.float64(x - moving.frame[0]):
         return True
-    for r in range(3):
-        named = scan_coordinate(scene, moving.pair, r) - scene.corners[voxel, r]
-        least = _least(scene.words, row, r)
-        if least != np.float64(named):
-            return least > np.float64(named)
-    return False
+    least = _least(scene.words, row, 0), _least(scene.words, row, 1), _least(scene.words, row, 2)
+    corner = scene.corners[voxel]
+    return least > (np.float64(x - corner[0]), np.float64(y - corner[1]), np.float64(z - corner[2]))
 
 
 @njit_inlined
@@ -319,3 +312,160 @@ def search(sweep, t0, t1, rows, state):
         if state_of(state, row) == HELD and not _sweep_voxel(sweep, chord, row):
             break
     return not (stopped(scene.stop) and moving.first[2] > 0.0), chord.final
+
+
+@njit_no_refcount
+def pair_times(gap, displacement, inner, outer):
+    """Compute when a point moving from `gap` by `displacement` is within `outer` and `inner`.
+
+    Returns (earliest_possible, earliest_certain, closest), fractions. earliest_possible: when it
+    comes within `outer`, rounded down; inf if it never does in [0, 1]. earliest_certain: when it
+    comes within `inner`, rounded up; inf likewise. closest: the fraction of closest approach, in
+    [0, 1].
+    """
+    length, apart = norm(displacement), norm(gap)
+    # Rounding of these lines: a few half units in the last place of the lengths, which are integers
+    # or far above 2^-500.
+    slack = 2.0**-48 * (apart + length)
+    outer, inner = outer + slack, inner - slack
+    at = -dot(gap, displacement) / (length * length) if length > 1e-100 else 0.0
+    closest = min(max(at, 0.0), 1.0)
+    nearest = plus(gap, times(closest, displacement))
+    if dot(nearest, nearest) > outer * outer:
+        return INFINITE, INFINITE, closest
+    earliest_possible, earliest_certain = INFINITE, INFINITE
+    if apart <= outer:
+        earliest_possible = 0.0
+        if apart <= inner:
+            return 0.0, 0.0, closest
+    if length <= 1e-100 or at <= 0.0:  # never nearer than now, and contact is not certain now
+        return earliest_possible, earliest_certain, closest
+    nearest = plus(gap, times(at, displacement))
+    square = dot(nearest, nearest)
+    late = 2.0**-48 * (1.0 + apart / length)
+    if earliest_possible > 0.0:
+        earliest_possible = max(at - math.sqrt(max(outer * outer - square, 0.0)) / length - late, 0.0)
+    if inner > 0.0 and square < inner * inner:
+        earliest_certain = max(at - math.sqrt(inner * inner - square) / length + late, 0.0)
+        if earliest_certain > 1.0:
+            earliest_certain = INFINITE
+    return earliest_possible, earliest_certain, closest
+
+
+@njit_no_refcount
+def _deficit_of(scene, pair):
+    """Return the largest radius of the scan minus that of a pair's scan point, exact units."""
+    return scene.radius_deficit[
+        point_class(scene.ints, pair[4], pair[5], np.uint64(scene.radius_deficit.shape[0] - 1))
+    ]
+
+
+@njit_no_refcount
+def touches_at(sweep, t, pair):
+    """Return whether one pair (as in MovingAvatar) is in contact under M(t), by NUMERICS.md N5."""
+    scene, moving = sweep.scene, sweep.moving
+    pose_at(sweep.motion, t, moving.pose)
+    put(moving.shift, minus(place_of(moving.pose), scene.origin))
+    units = sweep.units - _deficit_of(scene, pair)
+    block, lane, voxel, lane_at, block_at, j = pair
+    square = pair_square(sweep.avatar, moving.pose, block, lane, moving, scene, voxel, lane_at, block_at, j)
+    return square >= 0 and square <= units * units
+
+
+@njit_no_refcount
+def found_pair(moving):
+    """Return the pair that a search has found, see MovingAvatar."""
+    pair = moving.pair
+    return pair[0], pair[1], pair[2], pair[3], pair[4], pair[5]
+
+
+@njit_no_refcount
+def scan_point(scene, voxel, at, block, j):
+    """Return the lattice coordinates of a scan point [steps]. at, block: `lane_at`, `block_at` of a pair."""
+    corners, ints, halves = scene.corners, scene.ints, scene.halves
+    return (
+        corners[voxel, 0] + np.int64(ints[block]) + np.int64(halves[at + j]),
+        corners[voxel, 1] + np.int64(ints[block + 1]) + np.int64(halves[at + LANES + j]),
+        corners[voxel, 2] + np.int64(ints[block + 2]) + np.int64(halves[at + 2 * LANES + j]),
+    )
+
+
+@njit_no_refcount
+def pair_point(scene, pair):
+    """Return the lattice coordinates of a pair's scan point [steps]."""
+    return scan_point(scene, pair[2], pair[3], pair[4], pair[5])
+
+
+@njit_no_refcount
+def _comes_first(sweep, pair, other):
+    """Return whether `pair` precedes `other`, which touches at the same moment (NUMERICS.md N11).
+
+    The scan point decides first, then the avatar's centre at the beginning of the chord.
+    """
+    one, two = pair_point(sweep.scene, pair), pair_point(sweep.scene, other)
+    if one != two:
+        return one < two
+    return _placed_units(sweep, pair) < _placed_units(sweep, other)
+
+
+@njit_no_refcount
+def _placed_units(sweep, pair):
+    """Return a pair's avatar point at the beginning of the chord, exact units."""
+    moving = sweep.moving
+    x, y, z = placed(moving.ends[0], moving.shifts[0], point_of(sweep.avatar.points, pair[0], pair[1]))
+    return to_units(x), to_units(y), to_units(z)
+
+
+@njit_no_refcount
+def _certain_by_integers(sweep, chord, pair, earliest_possible, earliest_certain, closest):
+    """Return the fraction at which a pair certainly touches, also tested by integers at two poses.
+
+    It is for final chords. The poses are the first pose of the whole motion, where contact is that
+    of `collide`, and the pose where the pair is closest.
+    """
+    if (
+        earliest_possible == 0.0
+        and chord.t0 == 0.0
+        and earliest_certain > 0.0
+        and touches_at(sweep, 0.0, pair)
+    ):
+        return 0.0
+    if earliest_certain == INFINITE:
+        t = chord.t1 if closest >= 1.0 else chord.t0 + closest * (chord.t1 - chord.t0)
+        if touches_at(sweep, t, pair):
+            return closest
+    return earliest_certain
+
+
+@njit_no_refcount
+def try_pair(sweep, chord, pair):
+    """Update moving.first and moving.pair with one pair, in float64."""
+    scene, moving, first = sweep.scene, sweep.moving, sweep.moving.first
+    if first[2] <= 0.0 and not _comes_first(sweep, pair, found_pair(moving)):
+        return
+    ends, shifts, per_step = moving.ends, moving.shifts, scene.units_per_step
+    point, steps = point_of(sweep.avatar.points, pair[0], pair[1]), pair_point(scene, pair)
+    begin = times(UNITS_PER_METRE, placed(ends[0], shifts[0], point))
+    end = times(UNITS_PER_METRE, placed(ends[1], shifts[1], point))
+    cloud = (
+        np.float64(lattice_to_units(steps[0], per_step)),
+        np.float64(lattice_to_units(steps[1], per_step)),
+        np.float64(lattice_to_units(steps[2], per_step)),
+    )
+    deficit = np.float64(_deficit_of(scene, pair))
+    earliest_possible, earliest_certain, closest = pair_times(
+        minus(begin, cloud), minus(end, begin), chord.inner - deficit, chord.outer - deficit
+    )
+    if earliest_possible > first[2]:
+        return
+    key, best = earliest_possible, first[0]
+    if chord.final:
+        earliest_certain = _certain_by_integers(
+            sweep, chord, pair, earliest_possible, earliest_certain, closest
+        )
+        key, best = earliest_certain, first[1]
+    first[0] = min(first[0], earliest_possible)
+    if key < best or (key == best and key < INFINITE and _comes_first(sweep, pair, found_pair(moving))):
+        first[1], first[2] = earliest_certain, key
+        for n in range(6):
+            moving.pair[n] = pair[n]

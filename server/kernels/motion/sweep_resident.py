@@ -3,10 +3,6 @@
 The result is that of server/queries/sweep.py. The cost of a motion is then only its search: the
 arrays are passed by reference (array_references.py), and each inspection of a result's contents
 costs another call.
-
-A motion that touches ends `skin` before the contact. The operations and their order are those of
-server/simulation/world/frame.py, which computes the same for obstacles that are not of the scan. In
-one call with the sweep they take a tenth of the time.
 """
 
 import math
@@ -23,28 +19,26 @@ from ..core.reach import VALID, all_resident, check_poses
 from ..core.scene_arrays import SceneArrays, stopped
 from .moving_avatar import MovingAvatar, make_moving
 from .screw_motion import make_motion, pose_at
-from .sweep_advance import advance_segments
 from .sweep_segments import (
     PlanSpace,
     SweepProgress,
+    advance_segments,
     find_unknown_regions,
     make_plan_space,
     plan_segments,
 )
+from .vectors import column, copy_pose, dot, minus, norm, place_of, plus, put, times, vector
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
 # Result of `sweep_resident` for a motion that it does not answer.
 _NOT_ANSWERED = (-1, _UNKNOWN, 0, 0, 0)
 # Fields of the output: fractions, upper bound of the distance any point moves [m], the witness's
-# centres, world [m]; with a skin, how the motion ends (below), the touching point, avatar frame [m],
-# and the pose at which it ends, world.
+# centres, world [m], and whether the reach leaves the scene's bounds.
 SWEPT = (
     ("lower", "f8"), ("upper", "f8"), ("speed", "f8"), ("avatar", "f8", (3,)), ("cloud", "f8", (3,)),
-    ("ended", "i8"), ("point", "f8", (3,)), ("end", "f8", (4, 4)),
+    ("outside", "?"),
 )  # fmt: skip
-# How a motion ends: not known, or the pose may touch; where it began; at a pose that is proved clear.
-OPEN, STAYS, PROVED = 0, 1, 2
 # Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
 # `lower`.
 MIN_MOTION = 2e-5
@@ -59,8 +53,8 @@ MAX_SKIN_FACTOR = 4.0
 class OneMotion(NamedTuple):
     """Arrays of one motion, as those of k in sweep_segments.py and sweep_advance.py; scratch.
 
-    first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.
-    origin: (3,), zero.  pose: (4, 4).  The others are (1,).
+    first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.  origin: (3,), zero.
+    The others are (1,).
     """
 
     first: NDArray[np.float64]
@@ -72,7 +66,9 @@ class OneMotion(NamedTuple):
     cursor: NDArray[np.int64]
     moved: NDArray[np.float64]
     origin: NDArray[np.float64]
-    pose: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    until: NDArray[np.float64]
+    unknown_from: NDArray[np.float64]
 
 
 @reference
@@ -92,14 +88,10 @@ def make_scratch(avatar):
     )  # fmt: skip
     one = OneMotion(
         np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1, np.int64), progress, np.zeros((4, 1), np.uint32),
-        np.zeros(1, np.int64), np.zeros(1, np.int64), np.empty(1), np.zeros(3), np.empty((4, 4)),
+        np.zeros(1, np.int64), np.zeros(1, np.int64), np.empty(1), np.zeros(3), np.empty(1, np.bool_), np.empty(1),
+        np.empty(1),
     )  # fmt: skip
     return MotionScratch(make_moving(avatar), make_plan_space(), one)
-
-
-@njit_no_refcount
-def _norm(x, y, z):
-    return math.sqrt(x * x + y * y + z * z)
 
 
 @njit_no_refcount
@@ -108,43 +100,24 @@ def longest_way(pose_from, pose_to, avatar):
 
     pose_from, pose_to: (4, 4).
     """
-    wx, wy, wz = (
-        pose_to[0, 3] - pose_from[0, 3],
-        pose_to[1, 3] - pose_from[1, 3],
-        pose_to[2, 3] - pose_from[2, 3],
-    )
-    square, same = 0.0, True
+    square = 0.0
     for r in range(3):
         for c in range(3):
             turn = pose_to[r, c] - pose_from[r, c]
-            same &= pose_to[r, c] == pose_from[r, c]
             square += turn * turn
-    if same:
-        return _norm(wx, wy, wz)
-    x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
-    wx += _turned(pose_from, pose_to, 0, x, y, z)
-    wy += _turned(pose_from, pose_to, 1, x, y, z)
-    wz += _turned(pose_from, pose_to, 2, x, y, z)
-    return _norm(wx, wy, wz) + math.sqrt(square) * avatar.radius[0]
+    center = _moved(pose_from, pose_to, vector(avatar.center[0]))
+    return norm(center) + math.sqrt(square) * avatar.radius[0]
 
 
 @njit_no_refcount
-def _turned(pose_from, pose_to, r, x, y, z):
-    """Return coordinate r of the displacement of a place by the rotation from one pose to another."""
-    a, b, c = (
-        pose_to[r, 0] - pose_from[r, 0],
-        pose_to[r, 1] - pose_from[r, 1],
-        pose_to[r, 2] - pose_from[r, 2],
-    )
-    return a * x + b * y + c * z
-
-
-@njit_no_refcount
-def write_point(pose, place, point):
-    """Write a place (3,), world, in the frame of a pose (4, 4) to point (3,)."""
-    x, y, z = place[0] - pose[0, 3], place[1] - pose[1, 3], place[2] - pose[2, 3]
-    for k in range(3):
-        point[k] = pose[0, k] * x + pose[1, k] * y + pose[2, k] * z
+def _moved(pose_from, pose_to, place):
+    """Return by how much a place of the avatar's frame is moved from one pose to another [m]."""
+    x, y, z = vector(place)
+    # Column by column: the differences of the entries come before the products.
+    a = times(x, minus(column(pose_to, 0), column(pose_from, 0)))
+    b = times(y, minus(column(pose_to, 1), column(pose_from, 1)))
+    c = times(z, minus(column(pose_to, 2), column(pose_from, 2)))
+    return plus(minus(place_of(pose_to), place_of(pose_from)), plus(plus(a, b), c))
 
 
 @njit_no_refcount
@@ -157,28 +130,24 @@ def skin_fraction(pose_from, pose_to, own, cloud, point, way, skin):
     """
     if way <= 0.0 or skin <= 0.0:
         return 0.0
-    ox, oy, oz = own[0] - cloud[0], own[1] - cloud[1], own[2] - cloud[2]
-    gx = (pose_to[0, 3] - pose_from[0, 3]) + _turned(pose_from, pose_to, 0, point[0], point[1], point[2])
-    gy = (pose_to[1, 3] - pose_from[1, 3]) + _turned(pose_from, pose_to, 1, point[0], point[1], point[2])
-    gz = (pose_to[2, 3] - pose_from[2, 3]) + _turned(pose_from, pose_to, 2, point[0], point[1], point[2])
-    length, speed = _norm(ox, oy, oz), _norm(gx, gy, gz)
+    out, moved = minus(own, cloud), _moved(pose_from, pose_to, point)
+    length, speed = norm(out), norm(moved)
     if speed <= 1e-9 * way:
         return min(1.0, skin / way)
-    into = speed if length == 0.0 else -(gx * ox + gy * oy + gz * oz) / length
+    into = speed if length == 0.0 else -dot(moved, out) / length
     return skin / max(into, speed / MAX_SKIN_FACTOR)
 
 
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, body, scratch, other_units, held, stop, unknown_everywhere, tolerance, skin, result
+    pose_from, pose_to, body, scratch, other_units, held, stop, unknown_everywhere, tolerance, result
 ):  # fmt: skip
     """Sweep one motion if it is short and all voxels in its reach are resident.
 
     pose_from, pose_to: (4, 4) world, unchecked.  body, held: references to the arrays of an avatar
     that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  stop: (1,) int64, the
-    request's stop flag.  other_units, tolerance: as in kernels/motion/sweep_advance.py.  The
-    dataset's origin is subtracted from the motion as in server/queries/sweep.py.  skin: distance to
-    keep from what is touched [m]; negative: the end of the motion is not computed.
+    request's stop flag.  other_units, tolerance: as in `advance_segments`.  The
+    dataset's origin is subtracted from the motion as in server/queries/sweep.py.
     Writes held.one, the voxels in reach, and result, a record with the fields SWEPT; the witness is
     written where the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
@@ -187,9 +156,8 @@ def sweep_resident(
     avatar, box, scene, tree, lists = body.avatar, body.box, held.scene, held.tree, held.one.reach.lists
     one, origin = scratch.one, scene.origin
     first, last, units, progress, counts = one.first, one.last, one.units, one.progress, one.counts
-    for r in range(4):
-        for c in range(4):
-            first[0, r, c], last[0, r, c] = pose_from[r, c], pose_to[r, c]
+    copy_pose(pose_from, first[0])
+    copy_pose(pose_to, last[0])
     for poses in (first, last):
         fault, _, _ = check_poses(poses, avatar.radius, body.radius, other_units, scene, units)
         if fault != VALID:
@@ -220,58 +188,22 @@ def sweep_resident(
         if stopped(stop):
             return _NOT_ANSWERED
         proved = progress.lower[0]
-    upper = progress.upper[0]
+    upper, until, outside, unknown_from = progress.upper[0], one.until, one.outside, one.unknown_from
+    until[0] = min(upper, 1.0)
+    find_unknown_regions(
+        box, first, last, avatar, units, from_zero, tree, until, scratch.space, outside, unknown_from
+    )
     if unknown_everywhere:
         proved = 0.0
-    elif tree.unknown.shape[0] > 0:
-        until, outside, unknown_from = np.full(1, min(upper, 1.0)), np.zeros(1, np.bool_), np.empty(1)
-        find_unknown_regions(box, first, last, avatar, units, from_zero, tree, until, outside, unknown_from)
-        if unknown_from[0] <= until[0]:
-            proved = min(proved, unknown_from[0])
-    result.lower, result.upper, result.speed, result.ended = proved, upper, progress.speed[0], OPEN
+    elif unknown_from[0] <= until[0]:
+        proved = min(proved, unknown_from[0])
+    result.lower, result.upper, result.speed, result.outside = proved, upper, progress.speed[0], outside[0]
     verdict = _CLEAR if proved >= 1.0 else _UNKNOWN
     if upper < np.inf:
         verdict = _CONTACT
-        for r in range(3):
-            result.avatar[r] = progress.witness[0, 0, r] + origin[r]
-            result.cloud[r] = progress.witness[0, 1, r] + origin[r]
-        if skin >= 0.0:
-            _end_motion(pose_from, pose_to, box, avatar, origin, proved, skin, one, result)
+        put(result.avatar, plus(progress.witness[0, 0], origin))
+        put(result.cloud, plus(progress.witness[0, 1], origin))
     return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])
-
-
-@nb.njit(nogil=True, cache=True)
-def _end_motion(pose_from, pose_to, box, avatar, origin, lower, skin, one, result):
-    """Write how a motion ends that touches at the fraction `lower`. pose_from, pose_to: (4, 4), world.
-
-    one: `OneMotion`, with the motion from the dataset's origin.
-    """
-    motion = make_motion(one.first[0], one.last[0], box, one.origin)
-    _write_pose(motion, min(lower, 1.0), origin, one.pose)
-    own, cloud, point = result.avatar, result.cloud, result.point
-    write_point(one.pose, own, point)
-    way = longest_way(pose_from, pose_to, avatar)
-    fraction = lower - skin_fraction(pose_from, pose_to, own, cloud, point, way, skin)
-    if not fraction * way >= MIN_MOTION:
-        result.ended = STAYS
-        return
-    if fraction < lower and _write_pose(motion, fraction, origin, one.pose):
-        result.ended = PROVED
-        for r in range(4):
-            for c in range(4):
-                result.end[r, c] = one.pose[r, c]
-
-
-@njit_no_refcount
-def _write_pose(motion, fraction, origin, pose):
-    """Write the pose at a fraction of a motion to pose (4, 4), world, and return as `pose_between`."""
-    pose_at(motion, fraction, pose)
-    same = True
-    for r in range(3):
-        there = pose[r, 3]
-        pose[r, 3] = there + origin[r]
-        same &= pose[r, 3] - origin[r] == there
-    return same
 
 
 @nb.njit(nogil=True, cache=True)
@@ -282,21 +214,15 @@ def pose_between(pose_from, pose_to, fraction, box, origin, pose):
     the sweep's pose bit for bit, so that a proof of the sweep holds for this pose.
     """
     poses = np.empty((2, 4, 4))
-    for r in range(4):
-        for c in range(4):
-            poses[0, r, c], poses[1, r, c] = pose_from[r, c], pose_to[r, c]
+    copy_pose(pose_from, poses[0])
+    copy_pose(pose_to, poses[1])
     for r in range(3):
         poses[0, r, 3] -= origin[r]
         poses[1, r, 3] -= origin[r]
-    return _write_pose(make_motion(poses[0], poses[1], box, np.zeros(3)), fraction, origin, pose)
-
-
-@nb.njit(nogil=True, cache=True)
-def motion_bounds(pose_from, pose_to, box):
-    """Return speed and slip of a motion (screw_motion.py) relative to the origin at zero.
-
-    speed: upper bound of the distance that any avatar point moves per unit of t [m].  slip: upper
-    bound of the error of a placed point [m].
-    """
-    motion = make_motion(pose_from, pose_to, box, np.zeros(3))
-    return motion.speed, motion.slip
+    pose_at(make_motion(poses[0], poses[1], box, np.zeros(3)), fraction, pose)
+    same = True
+    for r in range(3):
+        there = pose[r, 3]
+        pose[r, 3] = there + origin[r]
+        same &= pose[r, 3] - origin[r] == there
+    return same

@@ -18,6 +18,7 @@ from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference, record_type, reference
 from ..motion.sweep_resident import SWEPT, MotionScratch
+from ..motion.vectors import place_of
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -48,26 +49,26 @@ SETTINGS = record_type(
     ("walkable", "f8"),
 )  # fmt: skip
 # Row of the tape. For a motion: the fields of `sweep_resident`. Then, for a hit: its verdict; the number
-# of its archive (-1: not of the scan); what of it is known; its normal; whether it is of a body (named),
-# and whether voxels are not in memory; the length of the motion that was left [m]. The answer of other
-# queries is `answer` or three heights.
+# of its archive (-1: not of the scan); what of it is known: the two centres, the touching point, avatar
+# frame [m], a pose at which the motion ends, and the normal; whether it is of a body (named), and whether
+# voxels are not in memory; the length of the motion that was left [m]. The answer of other queries is
+# `answer` or three heights.
 ROW = record_type(
-    *SWEPT, ("verdict", "i8"), ("archive", "i8"), ("has_pair", "?"), ("has_point", "?"), ("has_end", "?"),
-    ("has_normal", "?"), ("normal", "f8", (3,)), ("named", "?"), ("unloaded", "?"), ("rest", "f8"),
-    ("answer", "?"), ("heights", "f8", (3,)),
+    *SWEPT, ("verdict", "i8"), ("archive", "i8"), ("has_pair", "?"), ("has_point", "?"), ("point", "f8", (3,)),
+    ("has_end", "?"), ("end", "f8", (4, 4)), ("has_normal", "?"), ("normal", "f8", (3,)), ("named", "?"),
+    ("unloaded", "?"), ("rest", "f8"), ("answer", "?"), ("heights", "f8", (3,)),
 )  # fmt: skip
-# What repetitions keep: number of known rows, the query asked, whether the call repeats a frame's part,
-# number of voxels used, whether something in reach was not examined, whether no body was near where the
-# frame began and on its ways (1, NEAR: one was), and the node visits of each part.
+# What repetitions keep: number of rows that are known or asked about, the query asked, whether the call
+# repeats a frame's part, number of voxels used, whether something in reach was not examined, whether no
+# body was near where the frame began and on its ways (1, NEAR: one was), and the node visits of each part.
 LOG = record_type(
     ("known", "i8"), ("asked", "i8"), ("repeats", "?"), ("used", "i8"), ("missed", "?"), ("apart", "i8"),
     ("visits", "i8", (PARTS,)),
 )  # fmt: skip
 # What the query that Python answers is about; walker.py tells which fields each query has.
 QUESTION = record_type(
-    ("tolerance", "f8"), ("skin", "f8"), ("below", "?"), ("proved", "?"), ("stood", "?"), ("hit", "i8"),
-    ("archive", "i8"), ("level", "i8"), ("count", "i8"), ("reach", "f8"), ("place", "f8", (3,)),
-    ("toward", "f8", (3,)), ("directions", "f8", (3, 3)),
+    ("below", "?"), ("proved", "?"), ("stood", "?"), ("hit", "i8"), ("archive", "i8"), ("level", "i8"),
+    ("count", "i8"), ("reach", "f8"), ("place", "f8", (3,)), ("toward", "f8", (3,)), ("directions", "f8", (3, 3)),
 )  # fmt: skip
 # What the body keeps from the frame before: duration of the frame [s], speed of falling [m/s], whether
 # the avatar stood, point and normal of the plane that it stood on, and the place where it was raised last,
@@ -99,8 +100,7 @@ class WalkArrays(NamedTuple):
     question: NDArray[np.void]
     before: NDArray[np.void]
     state: NDArray[np.void]
-    bytes: NDArray[np.uint8]
-    saved_bytes: NDArray[np.uint8]
+    saved_state: NDArray[np.void]
     hits: NDArray[np.void]
     begin: NDArray[np.float64]
     target: NDArray[np.float64]
@@ -122,7 +122,18 @@ WalkMemory = reference(WalkArrays)
 
 @reference
 class Walk(NamedTuple):
-    """All that a frame reads and writes, see `walk_frame`."""
+    """All that a frame reads and writes.
+
+    avatar: reference to its arrays.  scratch: of its motions.  memory: state of the frame; the caller has
+    written how it begins.  held: reference to the scene's arrays.
+    stop, unknown_everywhere, other_units: as for `sweep_resident`.  alone: whether the scene is one
+    archive at the identity.  native: whether queries may be answered here: it is alone, and the avatar is
+    small and not empty.  bodies: whether other bodies are obstacles.
+    least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
+    squares: (3,) int64, the normal reach, thrice and nine times that, squared [steps^2]; 0 if invalid.
+    bounds, kinds, bounds_origin, wanted, own: of the bodies that may be in the way, as for
+    `find_near_bodies`.  margin: distance to keep from them [m].
+    """
 
     settings: NDArray[np.void]
     avatar: AvatarReference
@@ -149,21 +160,19 @@ class Walk(NamedTuple):
 def make_arrays(rows: int) -> WalkArrays:
     """Allocate the state of a frame. rows: of the tape.
 
-    log, question, before, state: one record each.  bytes: of `state`; saved: state before a call.
+    log, question, before, state: one record each.  saved: state before a call.
     hits: (rows,).  begin, target: (4, 4), where the frame began, and the commanded pose.
     poses: (2, 4, 4), the pose reached so far, and where the motion command was obstructed.
     asked_poses: of the query that Python answers.  used: voxels of all queries.
     verdict, counts, one: scratch of `collide_resident`.
     """
-    state = np.zeros(1, STATE)
     return WalkArrays(
         tape=np.zeros(rows, ROW),
         log=np.zeros(1, LOG),
         question=np.zeros(1, QUESTION),
         before=np.zeros(1, BEFORE),
-        state=state,
-        bytes=state.view(np.uint8),
-        saved_bytes=np.zeros(STATE.itemsize, np.uint8),
+        state=np.zeros(1, STATE),
+        saved_state=np.zeros(1, STATE),
         hits=np.zeros(rows, HIT),
         begin=np.zeros((4, 4)),
         target=np.zeros((4, 4)),
@@ -180,11 +189,7 @@ def make_arrays(rows: int) -> WalkArrays:
 @nb.njit(nogil=True, cache=True)
 def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
-    return WalkMemory(
-        arrays.tape, arrays.log, arrays.question, arrays.before, arrays.state, arrays.bytes, arrays.saved_bytes,
-        arrays.hits, arrays.begin, arrays.target, arrays.poses, arrays.saved_poses, arrays.asked_poses, arrays.used,
-        arrays.verdict, arrays.counts, arrays.one,
-    )  # fmt: skip
+    return WalkMemory(*arrays)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -196,12 +201,17 @@ def ask(memory, query):
 
 @nb.njit(nogil=True, cache=True)
 def next_row(memory):
-    """Return the row of the tape for the next query."""
-    row = memory.state[0].row
+    """Return the row of the tape for the next query, and whether its answer is known.
+
+    If not, the caller writes it, or asks Python to.
+    """
+    row, log = memory.state[0].row, memory.log[0]
     if row >= memory.tape.shape[0]:
         ask(memory, FULL)
     memory.state[0].row = row + 1
-    return row
+    known = row < log.known
+    log.known = max(log.known, row + 1)
+    return row, known
 
 
 @nb.njit(nogil=True, cache=True)
@@ -221,6 +231,12 @@ def use_voxels(walk, count):
 def pose_now(walk):
     """Return the pose (4, 4) that the frame has reached; callers do not write to it."""
     return walk.memory.poses[0]
+
+
+@nb.njit(nogil=True, cache=True)
+def place_now(walk):
+    """Return the translation of `pose_now`."""
+    return place_of(walk.memory.poses[0])
 
 
 @nb.njit(nogil=True, cache=True)

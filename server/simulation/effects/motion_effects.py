@@ -14,7 +14,7 @@ crease of two, and is zero between three. It is never directed against the motio
 longer than the remainder.
 
 A surface is a plane with the smoothed normal of the scan points around the touched one, or at an
-edge that of the avatar (kernels/walk/normals.py). The scan's spheres make a flat wall bumpy, by up to
+edge that of the avatar (kernels/walk/queries.py). The scan's spheres make a flat wall bumpy, by up to
 their radius. If a motion touches a plane that the frame has touched before, a bump obstructs it.
 The avatar then moves off the surface by a few millimetres and continues; the result is kept if it
 led farther along the motion command. Repeated frames of one motion command therefore improve the

@@ -17,7 +17,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
-from ...kernels.bodies.moving_bodies import make_body_scratch
+from ...kernels.bodies.body_sweep import make_body_scratch
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...queries.scene_data import to_units

@@ -22,7 +22,7 @@ from ...kernels.core.array_references import Held
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import make_scratch
 from ...kernels.walk import state
-from ...kernels.walk.slide import FLAT_REACH_FACTOR
+from ...kernels.walk.motions import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
 from ...queries.one_item import MAX_FAST_POINTS
 from ...queries.request import EXACT
@@ -154,24 +154,35 @@ class FrameMemory(threading.local):
 class WalkCall:
     """One call of the kernel for a frame: its state to and from arrays, and the answers to its queries."""
 
-    def __init__(self, thread: FrameMemory, reaches: tuple[float, ...], frame: Frame) -> None:
-        self._thread, self._reaches, self._frame = thread, reaches, frame
+    def __init__(self, walker: "Walker", thread: FrameMemory, frame: Frame) -> None:
+        self._walker, self._thread, self._frame = walker, thread, frame
         if frame.walk_hits is None:
             frame.walk_hits = {}
         self._hits: dict[int, Hit] = frame.walk_hits
 
     def begin(self) -> None:
-        """Write what the body keeps between frames, and the hits before the first part."""
-        kept, before = self._frame.body.effect_state, self._thread.before
-        plane, raised = kept.get(GROUND_PLANE), kept.get(RAISED)
+        """Write how the frame begins: what the body keeps between frames, and the hits before the first part."""
+        frame, body, thread, memory = self._frame, self._frame.body, self._thread, self._thread.memory
+        before, now, count = thread.before, thread.state, len(frame.hits)
+        memory.begin[:], memory.target[:], memory.poses[0] = body.pose, frame.target, frame.pose
+        memory.state[0] = np.zeros((), memory.state.dtype)
+        now.row[0], now.hits[0], now.blocked[0], now.stepped[0] = count, count, -1, math.nan
+        now.verdict[0], now.clear[0] = int(frame.verdict), frame.clear
+        before.seconds[0], before.fall_speed[0], before.stood[0] = (
+            frame.seconds,
+            body.fall_speed,
+            body.on_ground,
+        )
+        plane, raised = body.effect_state.get(GROUND_PLANE), body.effect_state.get(RAISED)
         before.has_plane[0], before.was_raised[0] = plane is not None, raised is not None
         if plane is not None:
             before.plane[0] = plane.reshape(2, 3)
         if raised is not None:
             before.raised_at[0] = raised
-        for row, hit in enumerate(self._frame.hits):
+        thread.hits.row[:count], thread.hits.has_normal[:count] = range(count), False
+        for row, hit in enumerate(frame.hits):
             self._write_hit(row, hit)
-        self._thread.log.known[0] = len(self._frame.hits)
+        thread.log.known[0] = count
 
     def finish(self) -> None:
         """Read the state that a frame has reached."""
@@ -196,7 +207,7 @@ class WalkCall:
     def answer(self) -> None:
         """Answer the query that the kernel asked."""
         thread, frame = self._thread, self._frame
-        query, row = thread.log.asked.item(), thread.log.known.item()
+        query, row = thread.log.asked.item(), thread.log.known.item() - 1
         if query == state.FULL:
             thread.grow()
             return
@@ -206,20 +217,15 @@ class WalkCall:
             self._answer(query, row, poses[1])
         finally:
             frame.pose = before
-        thread.log.known[0] = row + 1
 
     def _answer(self, query: int, row: int, to: Pose) -> None:
         """Write the answer of a query to its row. to: end of its motion."""
         frame, tape, question = self._frame, self._thread.tape, self._thread.question
-        world, pose, tolerance, below = (
-            frame.world,
-            frame.pose,
-            question.tolerance.item(),
-            question.below.item(),
-        )
+        world, pose, below = frame.world, frame.pose, question.below.item()
+        tolerance, skin = self._walker.tolerance, -1.0 if below else self._walker.skin
         place, level, archive = question.place[0].copy(), question.level.item(), question.archive.item()
         if query == state.SWEPT_TO:
-            self._write_hit(row, find_first_hit(frame, to, tolerance, question.skin.item(), below=below))
+            self._write_hit(row, find_first_hit(frame, to, tolerance, skin, below=below))
         elif query == state.BODIES_SWEPT:
             until = math.inf if tape.verdict[row] == int(Verdict.CLEAR) else tape.lower.item(row)
             hit = first_body_hit(frame, to, tolerance, until, below=below)
@@ -235,7 +241,7 @@ class WalkCall:
             hit = self._hits[question.hit.item()]
             tape.answer[row] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
         elif query == state.NORMAL_AT:
-            toward, reach = question.toward[0].copy(), self._reaches[level]
+            toward, reach = question.toward[0].copy(), self._walker.reaches[level]
             normal = world.normal_at(archive, place, toward, reach, frame.budget)
             tape.has_normal[row] = normal is not None
             if normal is not None:
@@ -243,7 +249,7 @@ class WalkCall:
         elif query == state.HIGHEST:
             touched = Hit(0.0, Verdict.CONTACT, None, place, archive=archive)
             directions = question.directions[0, : question.count.item()].copy()
-            heights = world.highest(touched, directions, self._reaches[level], frame.budget)
+            heights = world.highest(touched, directions, self._walker.reaches[level], frame.budget)
             tape.heights[row] = 0.0
             tape.heights[row, : len(heights)] = heights
         elif query == state.NEAREST:
@@ -328,6 +334,7 @@ class Walker:
     """Moves the avatars of one scene. Thread-safe.
 
     native: whether the kernel answers queries itself; tests compare both.
+    skin, tolerance: of sweeps [m].  reaches: of normals, by the level of `scan_normal` [m].
     """
 
     def __init__(self, world: Any) -> None:
@@ -335,10 +342,10 @@ class Walker:
         self.native = True
         self._world = world
         self._settings = _settings(world.file, world.up)
+        self.skin, self.tolerance = float(self._settings["skin"][0]), float(self._settings["tolerance"][0])
         reach = float(self._settings["normal_reach"][0])
         farther = min(FLAT_REACH_FACTOR * reach, MAX_NORMAL_REACH)
-        # By the level of `scan_normal`.
-        self._reaches = (reach, farther, min(SPARSE_FACTOR * farther, MAX_NORMAL_REACH))
+        self.reaches = (reach, farther, min(SPARSE_FACTOR * farther, MAX_NORMAL_REACH))
         self._has_normals = any(isinstance(effect, (Slide, Ground)) for effect in world.file.effects)
         self._thread = FrameMemory()
         self._code = Held(None)
@@ -349,14 +356,10 @@ class Walker:
         Raise the errors of queries and StoppedError; the frame is then undefined.
         """
         thread, world, body, budget = self._thread, frame.world, frame.body, frame.budget
-        call = WalkCall(thread, self._reaches, frame)
-        starts, frame.walks = not frame.walks, True
-        if starts:
+        call = WalkCall(self, thread, frame)
+        if not frame.walks:
+            frame.walks = True
             call.begin()
-        # Of the types that the kernel is compiled for; poses are C-contiguous float64 (`Pipeline.run`).
-        begin, target, pose = body.pose, frame.target, frame.pose
-        seconds, fell, tolerance = float(frame.seconds), float(body.fall_speed), float(budget.tolerance)
-        stood, clear, verdict = bool(body.on_ground), bool(frame.clear), int(frame.verdict)
         obstacles, bodies, wanted, margin = frame.obstacles, _NO_BODIES, 0, 0.0
         blocks = bool(obstacles)
         if blocks:
@@ -367,7 +370,7 @@ class Walker:
             each, alone, avatar = seen[0], world.is_alone, body.avatar
             data, residency, scratch = each.data, each.data.residency, thread.scratch_of(avatar)
             native = self.native and alone and 0 < len(avatar.points) <= MAX_FAST_POINTS
-            squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
+            squares = normals_of(each).squares(self.reaches) if self._has_normals else _NO_SQUARES
             held = data.references.to(data.arrays, data.tree)
             thread.log.repeats[0] = False
             while True:
@@ -376,13 +379,13 @@ class Walker:
                     if blocks:
                         margin = max([each.margin for each in obstacles])
                     with bodies.lock, residency.frozen():
-                        self._code.call(
-                            walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
+                        given = (
                             self._settings, avatar.reference, scratch, thread.reference, held.reference,
-                            data.arrays.stop, data.nothing_clear, alone, native, blocks, data.radius_units, tolerance,
-                            budget.tolerance_units, squares, bodies.bounds, bodies.kinds, bodies.origin, wanted,
-                            bodies.row_of(body.name, user=True), margin,
+                            data.arrays.stop, data.nothing_clear, alone, native, blocks, data.radius_units,
+                            float(budget.tolerance), budget.tolerance_units, squares, bodies.bounds, bodies.kinds,
+                            bodies.origin, wanted, bodies.row_of(body.name, user=True), margin,
                         )  # fmt: skip
+                        self._code.call(walk_frame, parts, given)
                         log, used = thread.log, thread.log.used.item()
                         if used:
                             rows = thread.memory.used[:used]

@@ -17,7 +17,7 @@ print(*[source_digest(name).hex() for name in sys.argv[2:]])
 """
 MODULES = [
     "server.kernels.collide.collide_poses",
-    "server.kernels.motion.contact_times",
+    "server.kernels.motion.sweep_interval",
     "schemas.kernels.morton",
     "builder.kernels.trees.pack_tree",
 ]
@@ -55,14 +55,14 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
     assert changed("server/kernels/collide/collide_poses.py") == {"server.kernels.collide.collide_poses"}
     assert changed("server/kernels/core/placed_avatar.py") == {
         "server.kernels.collide.collide_poses",
-        "server.kernels.motion.contact_times",
+        "server.kernels.motion.sweep_interval",
     }
     assert changed("schemas/runtime/compiling.py") == set(MODULES)
     assert changed("builder/kernels/trees/pack_tree.py") == {"builder.kernels.trees.pack_tree"}
     # A constant of a module that holds no kernel.
     assert changed("schemas/archive/units.py") == {
         "server.kernels.collide.collide_poses",
-        "server.kernels.motion.contact_times",
+        "server.kernels.motion.sweep_interval",
     }
     assert changed("server/scene.py") == set()
 

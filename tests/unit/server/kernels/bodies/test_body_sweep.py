@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.bodies import body_pairs
 from solidcloud.server.kernels.bodies import body_sweep as kernel
-from solidcloud.server.kernels.bodies import moving_bodies as placed
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
@@ -39,9 +38,9 @@ def units_of(model: AvatarModel) -> int:
     return int(np.rint(model.radius * naive.UNITS))
 
 
-def scratch_of(*models: AvatarModel) -> placed.BodyScratch:
+def scratch_of(*models: AvatarModel) -> kernel.BodyScratch:
     """Scratch that just holds these."""
-    return placed.make_body_scratch(
+    return kernel.make_body_scratch(
         max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models)
     )
 
@@ -49,7 +48,7 @@ def scratch_of(*models: AvatarModel) -> placed.BodyScratch:
 def ask(
     a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
     b: AvatarModel, poses: NDArray[np.float64], margin: float = 0.0, until: float = np.inf,
-    scratch: placed.BodyScratch | None = None,
+    scratch: kernel.BodyScratch | None = None,
 ) -> Asked:  # fmt: skip
     """Ask for all bodies at once."""
     ends = [pose.copy() for pose in (first, last)]

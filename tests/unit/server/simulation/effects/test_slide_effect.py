@@ -12,7 +12,7 @@ from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.avatar_shape import avatar_shape
-from solidcloud.server.kernels.walk.slide import clip as clip_rest
+from solidcloud.server.kernels.walk.motions import clip as clip_rest
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2

@@ -1,4 +1,4 @@
-"""Vectors and rotations in compiled code: tuples of three float64.
+"""Vectors, points and poses in compiled code. A vector is a tuple of three float64, and may be an array (3,).
 
 The operations and their order are those of server/simulation/world/vectors.py, so that both give the
 same bits.
@@ -10,6 +10,8 @@ import numpy as np
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
+
+Vector = tuple[float, float, float]
 
 
 @njit_no_refcount
@@ -32,48 +34,53 @@ def place_of(pose):
 
 @njit_no_refcount
 def dot(one, other):
-    """Return the dot product."""
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 @njit_no_refcount
 def norm(one):
-    """Return the length."""
     return math.sqrt(one[0] * one[0] + one[1] * one[1] + one[2] * one[2])
 
 
 @njit_no_refcount
 def plus(one, other):
-    """Return the sum."""
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 @njit_no_refcount
 def minus(one, other):
-    """Return the difference."""
     return one[0] - other[0], one[1] - other[1], one[2] - other[2]
 
 
 @njit_no_refcount
 def times(factor, one):
-    """Return a multiple."""
     return factor * one[0], factor * one[1], factor * one[2]
 
 
 @njit_no_refcount
 def divided(one, by):
-    """Return the quotient of a vector and a number."""
     return one[0] / by, one[1] / by, one[2] / by
 
 
 @njit_no_refcount
 def cross(one, other):
-    """Return the cross product."""
     return (
         one[1] * other[2] - one[2] * other[1],
         one[2] * other[0] - one[0] * other[2],
         one[0] * other[1] - one[1] * other[0],
     )
+
+
+@njit_no_refcount
+def column(pose, c):
+    """Return a column of the rotation of a pose (4, 4)."""
+    return pose[0, c], pose[1, c], pose[2, c]
+
+
+@njit_no_refcount
+def point_of(points, block, lane):
+    """Return a point of an avatar, avatar frame [m]. points: (b, 3, LANES)."""
+    return points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
 
 
 @njit_no_refcount
@@ -84,6 +91,12 @@ def rotate(pose, one):
         pose[1, 0] * one[0] + pose[1, 1] * one[1] + pose[1, 2] * one[2],
         pose[2, 0] * one[0] + pose[2, 1] * one[1] + pose[2, 2] * one[2],
     )
+
+
+@njit_no_refcount
+def placed(pose, shift, point):
+    """Return a point placed by a pose, by the formula of `place`. shift: (3,), t - O [m]."""
+    return plus(rotate(pose, point), shift)
 
 
 @njit_no_refcount
@@ -123,16 +136,3 @@ def translated(pose, way):
     for r in range(3):
         there[r, 3] += way[r]
     return there
-
-
-@njit_no_refcount
-def lowest_height(points, radius, pose, up):
-    """Return the lowest height of spheres under a pose, along `up` [m].
-
-    points: (n, 3) float64, their centres in the pose's frame; n > 0.  radius: [m].
-    """
-    down = rotate_back(pose, up)
-    least = np.inf
-    for n in range(points.shape[0]):
-        least = min(least, points[n, 0] * down[0] + points[n, 1] * down[1] + points[n, 2] * down[2])
-    return dot(place_of(pose), up) + least - radius

@@ -61,8 +61,7 @@ from .scene_archives import (
     read_avatars,
 )
 from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, QueryMethods, list_avatars
-from .simulation.local_session import LocalSession
-from .simulation.simulation import Simulation, make_simulation
+from .simulation.simulation import LocalSession, Simulation, make_simulation
 from .tiles.scene_overview import read_overview
 from .tiles.voxel_list import list_voxels
 from .tiles.voxel_tile import read_tile

@@ -5,7 +5,7 @@ arrays are passed by reference (array_references.py), and each inspection of a r
 costs another call.
 
 A motion that touches ends `skin` before the contact. The operations and their order are those of
-server/simulation/world/frame.py, which computes the same for obstacles that are not of the scan. In
+server/simulation/world/first_hits.py, which computes the same for obstacles that are not of the scan. In
 one call with the sweep they take a tenth of the time.
 """
 

@@ -1,6 +1,6 @@
 """Vectors and rotations in compiled code: tuples of three float64.
 
-The operations and their order are those of server/simulation/world/vectors.py, so that both give the
+The operations and their order are those of server/simulation/world/frame.py, so that both give the
 same bits.
 """
 

@@ -5,7 +5,7 @@ Effect `crowd`: users do not walk through one another.
 The other users are obstacles at their current poses. Users whose turn came earlier in this frame
 have already moved; the replay log records the order. A user blocks the others and is not moved by
 them. Users that overlap, for example because they entered at the same place, may separate but not
-move deeper (body_obstacles.py).
+move deeper (bodies.py).
 
 Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
@@ -33,10 +33,8 @@ from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.request import QueryBudget
 from ...queries.scene_data import to_units
-from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
-from ..world.body_obstacles import BodyObstacle, warm_kernels
-from ..world.frame import Frame, Hit, Pose, Run, Vec, lowest_height, translated
-from ..world.vectors import dot, horizontal, norm
+from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
+from ..world.frame import Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 
 # Largest permitted margin of `crowd` [m].
 _MAX_MARGIN = 8.0

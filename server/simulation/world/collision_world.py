@@ -36,8 +36,7 @@ from ...queries.request import EXACT, QueryBudget
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
-from .frame import Hit, Pose, Vec
-from .vectors import min_height, unit_vector
+from .frame import Hit, Pose, Vec, min_height, unit_vector
 
 _Answers = TypeVar("_Answers", CollideAnswers, ContactsAnswers, DistanceAnswers, SweepAnswers, WithinAnswers)
 

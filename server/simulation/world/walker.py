@@ -27,20 +27,8 @@ from ...kernels.walk.walk_frame import walk_frame
 from ...queries.one_item import MAX_FAST_POINTS
 from ...queries.request import EXACT
 from .collision_world import SPARSE_FACTOR, World, normals_of
-from .frame import (
-    Frame,
-    Hit,
-    Pose,
-    Vec,
-    find_touched,
-    first_body_hit,
-    is_clear,
-    lowest_height,
-    touches_bodies,
-    translated,
-)
-from .leaving import find_first_hit
-from .vectors import dot
+from .first_hits import find_first_hit, find_touched, first_body_hit, is_clear, touches_bodies
+from .frame import Frame, Hit, Pose, Vec, dot, lowest_height, translated
 
 # Parts of a frame that effects run.
 FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND

@@ -15,7 +15,7 @@ from solidcloud.server.simulation.simulation import (
     frame_durations,
     target_pose,
 )
-from solidcloud.server.simulation.world.vectors import rotation_matrix
+from solidcloud.server.simulation.world.frame import rotation_matrix
 
 pytestmark = pytest.mark.interpreted
 

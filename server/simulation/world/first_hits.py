@@ -1,6 +1,6 @@
-"""First hits of motions, and motions that begin in contact with the scan.
+"""First hits of a frame's motions with the scan and other bodies, and motions that begin in contact.
 
-The rule for those is in schemas/SCENE.md, "A user in contact".
+The rule for the latter is in schemas/SCENE.md, "A user in contact".
 """
 
 import math
@@ -22,13 +22,14 @@ from .frame import (
     Hit,
     Pose,
     Vec,
-    first_body_hit,
-    is_clear,
+    dot,
+    frobenius_norm,
     is_translation,
-    max_displacement,
+    norm,
+    rotate,
+    rotate_back,
     translated,
 )
-from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
@@ -249,6 +250,62 @@ def find_first_hit(
     return first_body_hit(frame, to, tolerance, until, below=below) or found
 
 
+def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, below: bool) -> Hit | None:
+    """Return the first hit of the motion from frame.pose to a pose with obstacles, before `until`.
+
+    until: fraction of the motion.  below: as for `find_first_hit`.
+    """
+    found = None
+    for obstacle in frame.obstacles:
+        hit = obstacle.sweep(frame.body.avatar, frame.pose, to, tolerance, below=below)
+        if hit is not None and hit.fraction < until:
+            found, until = hit, hit.fraction
+    return found
+
+
+def find_touched(frame: Frame, pose: Pose) -> Hit | None:
+    """Return a hit with fraction 0 if a pose touches something or is unknown, or None."""
+    avatar, lacked = frame.body.avatar, frame.lacked
+    verdict = frame.world.collide(avatar, pose, frame.budget)
+    if verdict == Verdict.CONTACT:
+        return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
+    if verdict == Verdict.UNKNOWN:
+        return Hit(0.0, verdict, None, None, unloaded=frame.lacked > lacked)
+    return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
+
+
+def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
+    """Return whether it is known that nothing is touched at a pose.
+
+    proved: whether this is already proved for the scene; then only obstacles are tested.
+    """
+    avatar = frame.body.avatar
+    if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
+        return False
+    return not touches_bodies(frame, pose)
+
+
+def touches_bodies(frame: Frame, pose: Pose) -> bool:
+    """Return whether an obstacle is touched at a pose."""
+    return any(each.touches(frame.body.avatar, pose) for each in frame.obstacles)
+
+
+def max_displacement(frame: Frame, to: Pose) -> float:
+    """Return an approximate bound of the distance that any avatar point moves to a pose [m].
+
+    The motion begins at frame.pose.
+    """
+    avatar, begin = frame.body.avatar, frame.pose
+    if not len(avatar.points):
+        return 0.0
+    way = to[:3, 3] - begin[:3, 3]
+    if is_translation(begin, to):
+        return norm(way)
+    turn = to[:3, :3] - begin[:3, :3]
+    center = way + rotate(turn, avatar.arrays.center[0])
+    return norm(center) + frobenius_norm(turn) * float(avatar.arrays.radius[0])
+
+
 def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:
     """Move to the pose the skin before a hit on the way to a pose (4, 4), or to a clear one before it.
 
@@ -269,3 +326,10 @@ def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:
             frame.pose = pose
             return
         back = max(_STEP_GROWTH * back, _FIRST_STEP_BACK / way)
+
+
+def record_hit(frame: Frame, hit: Hit) -> None:
+    """Record a hit where the frame begins."""
+    frame.hits.append(hit)
+    if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
+        frame.verdict = Verdict.UNKNOWN

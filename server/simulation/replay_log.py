@@ -140,7 +140,6 @@ def take_record(turn: LoggedTurn, body: Body, world: Any, bodies: "Bodies | None
         body.effect_state.pop(name, None)
     body.effect_state.update({name: np.array(value) for name, value in record.kept.items()})
     if bodies is not None:
-        bodies.begin()
         for name, pose in record.pushed.items():
             if (row := bodies.row_of(name, user=False)) >= 0:
                 bodies.put(row, cast(Pose, np.array(pose)))

@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Self
 
@@ -102,19 +102,6 @@ _FILES = {
 _WALKING = ("sweep", "slide", "step", "ground")
 
 
-@dataclass(slots=True)
-class _Presence:
-    """User in the scene.
-
-    body: its body.  time, heard: time of its last command, on its own and on the server's clock
-    [s].
-    """
-
-    body: Body
-    time: float | None = None
-    heard: float = 0.0
-
-
 class Simulation:
     """Frames of a scene. Thread-safe.
 
@@ -125,7 +112,7 @@ class Simulation:
     def __init__(self, scene: Any, file: SceneFile, pipeline: "Pipeline") -> None:
         self.scene, self.file, self._pipeline = scene, file, pipeline
         self._up = unit_vector(file.up)
-        self._present: dict[User, _Presence] = {}
+        self._present: dict[User, Body] = {}
         self._bodies: Bodies | None = pipeline.bodies
         self._recorder: FrameLog | None = None
         self._frames = 0
@@ -209,7 +196,7 @@ class Simulation:
         """
         with self._frame:
             if now is not None:
-                self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
+                self._remove([u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS])
             self._frames += 1
             outcomes = []
             for number, turn in enumerate(turns):
@@ -223,8 +210,7 @@ class Simulation:
                 used: list[bytes] = []
                 with recording_avatars(used):
                     state = self._simulate_turn(turn, now, budget, was)
-                there = self._present.get(turn.user)
-                body = None if there is None else there.body
+                body = self._present.get(turn.user)
                 outcomes.append(
                     FrameResult(turn.user, state, b"".join(used) if body is None else body.avatar.digest)
                 )
@@ -272,28 +258,26 @@ class Simulation:
         logged: LoggedTurn | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
-        present = self._present.get(user) or self._enter(user, command)
-        body, bodies = present.body, self._bodies
+        body, bodies = self._present.get(user) or self._enter(user, command), self._bodies
         with ExitStack() as undo:  # a command that is refused or stopped changes nothing
             if bodies is not None:
-                undo.callback(bodies.restore, bodies.snapshot())
+                undo.callback(bodies.restorer())
             if command.objects:
                 if bodies is None:
                     raise BadRequestError(
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
-                undo.callback(bodies.place_objects(command.objects, budget.stop))
+                bodies.place_objects(command.objects, budget.stop)
             if logged is None or logged.body is None:
-                durations = frame_durations(command, present.time)
+                durations = frame_durations(command, body.time)
                 if len(durations) > 1:
                     undo.callback(_restore, body, replace(body, effect_state=dict(body.effect_state)))
                 moved = self._run_frames(body, command, durations, budget)
             else:
                 moved = take_record(logged, body, self.world, bodies)
             undo.pop_all()
-        present.time = command.time
-        present.heard = present.heard if now is None else now
-        self._present[user] = present
+        body.time, body.heard = command.time, body.heard if now is None else now
+        self._present[user] = body
         if bodies is not None:
             bodies[user] = body
         return moved
@@ -318,8 +302,8 @@ class Simulation:
             unknown=any(moved.unknown for moved in moves),
         )
 
-    def _enter(self, user: User, command: Wish) -> _Presence:
-        """Return the presence of a new user. Raises BusyError if the scene is full."""
+    def _enter(self, user: User, command: Wish) -> Body:
+        """Return the body of a new user. Raises BusyError if the scene is full."""
         if len(self._present) >= self.most_users:
             raise BusyError(
                 f"{self.scene.name}: {len(self._present)} users are in it, the maximum of its limits: try again later"
@@ -327,7 +311,7 @@ class Simulation:
         avatar = self.scene.avatar(user.avatar, user.client)
         if self._recorder is not None:
             self._recorder.entered(user, avatar)
-        return _Presence(_make_body(user, avatar, first_pose(command, self.file.spawn, self._up)))
+        return _make_body(user, avatar, first_pose(command, self.file.spawn, self._up))
 
     def _remove(self, users: list[User]) -> None:
         """Remove the bodies of users."""

@@ -34,7 +34,7 @@ from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.request import QueryBudget
 from ...queries.scene_data import to_units
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
-from ..world.frame import Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
+from ..world.frame import Body, Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 
 # Largest permitted margin of `crowd` [m].
 _MAX_MARGIN = 8.0
@@ -80,16 +80,13 @@ def bodies_of(world: Any) -> Bodies:
     """Return the bodies of a scene, which its effects share. They begin with the objects of its file."""
     if world.bodies is None:
         with world as seen:
-            world.bodies = Bodies(seen[0].data.arrays.origin, world.up, partial(_add_objects, world))
-    bodies: Bodies = world.bodies
-    return bodies
-
-
-def _add_objects(world: Any, bodies: Bodies) -> None:
-    """Add the objects of a scene at their initial poses."""
-    for item in world.file.objects:
-        model = world.avatar(item.avatar)
-        bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+            bodies = Bodies(seen[0].data.arrays.origin, world.up)
+        for item in world.file.objects:
+            model = world.avatar(item.avatar)
+            bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+        world.bodies = bodies
+    found: Bodies = world.bodies
+    return found
 
 
 def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
@@ -97,7 +94,6 @@ def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
 
     margin_units: distance between users, exact units.
     """
-    bodies.begin()
     frame.obstacles.append(UserObstacle(bodies, frame, margin_units))
     return CrowdReport()
 
@@ -107,17 +103,13 @@ class UserObstacle(BodyObstacle):
 
     def __init__(self, bodies: Bodies, frame: Frame, margin_units: int) -> None:
         """Create the obstacle for one frame of one user."""
-        body, stop = frame.body, frame.budget.stop
-        super().__init__(
-            "crowd", bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
-        )
+        super().__init__(bodies, USER, frame.body, frame.budget.stop, margin_units=margin_units)
         self._met: set[str] = set()
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
         """Count the user that ended the motion; return False, because users do not give way."""
-        if self.is_own(hit):
-            self._met.add(hit.what)
-            frame.reports[self.name] = CrowdReport(len(self._met))
+        self._met.add(hit.what)
+        frame.reports["crowd"] = CrowdReport(len(self._met))
         return False
 
 
@@ -142,7 +134,6 @@ class ObjectsRunner:
         """
         bodies = self.bodies
         with bodies.lock:
-            bodies.begin()
             since, frame.effect_state["objects"] = frame.body.effect_state.get("objects", 0), bodies.clock
             frame.obstacles.append(ObjectObstacle(self, frame, since))
             return self.report(since, frame.budget)
@@ -194,8 +185,8 @@ class ObjectPush:
         self._world, self._budget, self._pusher = pusher.world, pusher.budget, pusher
         self._model, self._pose = bodies.shapes[row].model, bodies.poses[row].copy()
         self._others = BodyObstacle(
-            "objects", bodies, USER | KINEMATIC | PUSHED, bodies.names[row], self._model, self._pose,
-            user=False, skip=user, stop=pusher.budget.stop,
+            bodies, USER | KINEMATIC | PUSHED, Body(bodies.names[row], self._model, self._pose), pusher.budget.stop,
+            user=False, skip=user,
         )  # fmt: skip
 
     def result(self) -> Pose | None:
@@ -314,10 +305,7 @@ class ObjectObstacle(BodyObstacle):
 
     def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
         """Create the obstacle for a frame. since: clock of the last moves reported to its user."""
-        body, stop = frame.body, frame.budget.stop
-        super().__init__(
-            "objects", runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
-        )
+        super().__init__(runner.bodies, KINEMATIC | PUSHED, frame.body, frame.budget.stop)
         self._runner, self._since = runner, since
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
@@ -327,7 +315,7 @@ class ObjectObstacle(BodyObstacle):
         pushes no object.
         """
         bodies = self._runner.bodies
-        if not self.is_own(hit) or hit.avatar is None or hit.cloud is None:
+        if hit.avatar is None or hit.cloud is None:
             return False
         with bodies.lock:
             row = bodies.row_of(hit.what, user=False)
@@ -341,5 +329,5 @@ class ObjectObstacle(BodyObstacle):
             if pushed is None or frame.budget.stop:
                 return False  # if stopped, the result may be incomplete
             bodies.put(row, pushed)
-            frame.reports[self.name] = self._runner.report(self._since, frame.budget)
+            frame.reports["objects"] = self._runner.report(self._since, frame.budget)
             return True

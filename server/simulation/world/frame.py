@@ -45,6 +45,7 @@ class Hit(NamedTuple):
     not known.
     upper: fraction at which it certainly touches; inf if not known.  exact: whether no other contact
     can come first, and no avatar point moves farther than the tolerance from `fraction` to `upper`.
+    obstacle: the `BodyObstacle` (bodies.py) that was hit, or None.
     """
 
     fraction: float
@@ -60,6 +61,7 @@ class Hit(NamedTuple):
     end: Pose | None = None
     upper: float = math.inf
     exact: bool = True
+    obstacle: Any = None
 
 
 @dataclass(slots=True)
@@ -72,6 +74,7 @@ class Body:
     clear: whether `pose` was found clear, for the archives `generations` (World.generations).
     effect_state: data that effects keep between frames, by effect name.
     user: client and avatar.
+    time, heard: time of its last command, on its own and on the server's clock [s].
     """
 
     name: str
@@ -83,6 +86,8 @@ class Body:
     generations: tuple[int, ...] = ()
     effect_state: dict[str, Any] = field(default_factory=dict)
     user: tuple[str, str] = ("", "")
+    time: float | None = None
+    heard: float = 0.0
 
 
 @dataclass(slots=True)

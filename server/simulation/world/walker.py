@@ -221,7 +221,7 @@ class WalkCall:
             self._write_hit(row, find_touched(frame, pose))
         elif query == state.GIVES_WAY:
             hit = self._hits[question.hit.item()]
-            tape.answer[row] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
+            tape.answer[row] = hit.obstacle is not None and hit.obstacle.give_way(frame, hit, to)
         elif query == state.NORMAL_AT:
             toward, reach = question.toward[0].copy(), self._reaches[level]
             normal = world.normal_at(archive, place, toward, reach, frame.budget)

@@ -133,7 +133,7 @@ class StopRunner:
         """
         self._skin, self._tolerance = float(effect.skin), float(sweep_tolerance(world.file))
         declared = {type(each) for each in world.file.effects}
-        self._level: Callable[[Frame], None] | None = None
+        self._levels = Ground in declared
         self._follow: Callable[[Frame], None] | None = self._follow_alone
         if walks:
             from ..world.walker import FOLLOW, walker_of
@@ -143,13 +143,11 @@ class StopRunner:
             self._follow = None if Sweep in declared else partial(walker.run, parts=FOLLOW)
         else:
             self._warm(world)
-        if Ground in declared:
-            self._level = level_command
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
-        if self._level is not None:
-            self._level(frame)
+        if self._levels:
+            level_command(frame)
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)

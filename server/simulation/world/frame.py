@@ -154,8 +154,7 @@ def dot(one: Vec, other: Vec) -> float:
 
 def norm(vector: Vec) -> float:
     """Return the length of a vector (3,)."""
-    x, y, z = vector.tolist()
-    return math.sqrt(x * x + y * y + z * z)
+    return math.sqrt(dot(vector, vector))
 
 
 def unit_vector(vector: tuple[float, float, float]) -> Vec:
@@ -189,7 +188,11 @@ def multiply(one: Matrix, other: Matrix) -> Matrix:
 
 def frobenius_norm(matrix: Matrix) -> float:
     """Return the Frobenius norm of a matrix (3, 3), which bounds its largest singular value."""
-    return math.sqrt(sum(x * x for row in matrix.tolist() for x in row[:3]))
+    square = 0.0  # `sum` adds the rounding errors too, from Python 3.12 on
+    for row in matrix.tolist():
+        for x in row[:3]:
+            square += x * x
+    return math.sqrt(square)
 
 
 def min_height(points: NDArray[np.float64], up: Vec) -> float:

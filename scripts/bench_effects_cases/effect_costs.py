@@ -153,8 +153,7 @@ class Stage:
         ]
         if pipeline.bodies is not None:
             for body in bodies:
-                client, _, avatar = body.name.rpartition("/")
-                pipeline.bodies[client, avatar] = body
+                pipeline.bodies.put_user(body)
         took = np.empty(apart)
         for number in range(apart):
             wishes = [

@@ -5,7 +5,8 @@ command asks for, through the effects in their order (`Pipeline`). `move` simula
 keeps no state. `step` simulates one frame of all users with a motion command, and keeps their bodies
 until they end. A `LocalSession` sends it the commands of one user in this process. The same commands
 in the same order give the same poses, bit for bit: a clock is read only to report how long a frame
-took. The `stop` flag of a frame is that of its deadline; what is stopped stays where it was.
+took. A frame's deadline is set by who calls `step` (zenoh_server/command_mailboxes.py), as a `stop`
+flag: users that are not simulated by then stay where they are.
 
 Files of effects that the scene does not declare are not imported (NUMERICS.md case 31).
 """
@@ -17,7 +18,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Self
 
@@ -270,8 +271,8 @@ class Simulation:
                 bodies.place_objects(command.objects, budget.stop)
             if logged is None or logged.body is None:
                 durations = frame_durations(command, body.time)
-                if len(durations) > 1:
-                    undo.callback(_restore, body, replace(body, effect_state=dict(body.effect_state)))
+                if len(durations) > 1:  # one that fails leaves the body as it was
+                    body = replace(body, effect_state=dict(body.effect_state))
                 moved = self._run_frames(body, command, durations, budget)
             else:
                 moved = take_record(logged, body, self.world, bodies)
@@ -279,7 +280,7 @@ class Simulation:
         body.time, body.heard = command.time, body.heard if now is None else now
         self._present[user] = body
         if bodies is not None:
-            bodies[user] = body
+            bodies.put_user(body)
         return moved
 
     def _run_frames(self, body: Body, command: Wish, durations: list[float], budget: QueryBudget) -> Moved:
@@ -287,7 +288,7 @@ class Simulation:
         moves: list[Moved] = []
         for seconds in durations:
             if moves and self._bodies is not None:
-                self._bodies[body.user] = body
+                self._bodies.put_user(body)
             target = target_pose(command, body.pose, seconds, self._up)
             moves.append(self._pipeline.run(body, target, seconds, budget))
         last = moves[-1]
@@ -319,7 +320,7 @@ class Simulation:
         for user in users:
             del self._present[user]
             if self._bodies is not None:
-                self._bodies.pop(user)
+                self._bodies.remove_user(_public_name(user))
         if users and self._recorder is not None:
             self._recorder.frame.ended += users
 
@@ -353,11 +354,11 @@ class Simulation:
                 with self._frame, suppress(SolidcloudError):  # such a frame may be impossible here
                     body = _make_body(user, self.scene.avatar("warm", _WARM), first)
                     if self._bodies is not None:
-                        self._bodies[other] = _make_body(other, body.avatar, (first + last) / 2)
+                        self._bodies.put_user(_make_body(other, body.avatar, (first + last) / 2))
                     for pose in (last, last, first):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
         if self._bodies is not None:
-            self._bodies.pop(other)
+            self._bodies.remove_user(_public_name(other))
         self.scene.forget_client(_WARM)
 
 
@@ -417,12 +418,6 @@ def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
     if command.velocity is not None:
         raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
     return check_rigid(command.pose[0].copy(), "pose")
-
-
-def _restore(body: Body, before: Body) -> None:
-    """Restore the state of a body."""
-    for each in fields(body):
-        setattr(body, each.name, getattr(before, each.name))
 
 
 def make_simulation(scene: Any, file: SceneFile) -> Simulation:
@@ -563,8 +558,7 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
 
 def _moved(frame: Frame, unknown: bool) -> Moved:
     """Return the answer for a frame. unknown: as in `Moved`."""
-    x, y, z = frame.remaining.tolist()
-    left = (x * x + y * y + z * z) ** 0.5
+    left = norm(frame.remaining)
     return Moved(
         pose=frame.pose[None].copy(),
         verdict=int(frame.verdict),

@@ -79,15 +79,15 @@ class Stage:
 
     def enter(self, name: str, model: AvatarModel, pose: NDArray[np.float64]) -> Body:
         """Add a user."""
-        body = self.users[name] = Body(name, model, pose.copy())
-        self.bodies[name] = body
+        body = self.users[name] = Body(name, model, pose.copy(), time=0.0)
+        self.bodies.put_user(body)
         return body
 
     def go(self, name: str, wish: NDArray[np.float64], seconds: float = 1 / 30) -> Moved:
         """Simulate one frame of one user."""
         body = self.users[name]
         moved = self.pipeline.run(body, wish, seconds)
-        self.bodies[name] = body
+        self.bodies.put_user(body)
         return moved
 
     def step(self, name: str, way: Any) -> Moved:

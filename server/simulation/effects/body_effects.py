@@ -311,15 +311,15 @@ class ObjectObstacle(BodyObstacle):
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
         """Push the object that ended the motion by the rest of the way; return whether it moved.
 
-        Only pushable objects move, as far as they touch nothing. `Simulation.move`, which keeps no state,
-        pushes no object.
+        Only pushable objects move, as far as they touch nothing. A user's first frame and `Simulation.move`,
+        which keeps no state, push no object.
         """
         bodies = self._runner.bodies
         if hit.avatar is None or hit.cloud is None:
             return False
         with bodies.lock:
             row = bodies.row_of(hit.what, user=False)
-            if row < 0 or bodies.kinds[row] != PUSHED or not bodies.is_present(frame.body):
+            if row < 0 or bodies.kinds[row] != PUSHED or frame.body.time is None:
                 return False
             left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
             inward = horizontal(hit.cloud - hit.avatar, bodies.up)

@@ -1,7 +1,7 @@
 """Bodies: everything that moves in one scene, users and objects, with their current poses.
 
-A simulation has at most one `Bodies`. It updates the users as in a dict (`bodies[user] = body`
-after each frame, `pop`), and the objects that motion commands place (`place_objects`).
+A simulation has at most one `Bodies`. It updates a user after each of its frames (`put_user`), and the
+objects that motion commands place (`place_objects`).
 
 Effects query the bodies through a `BodyObstacle`: those that obstruct one mover during one frame.
 First, one kernel call of some microseconds tests the bounds of all bodies against those of the
@@ -17,7 +17,7 @@ there, can therefore always separate.
 
 import math
 import threading
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -106,7 +106,6 @@ class Bodies:
         self.changed: list[int] = []
         self.clock = self.layout = 0
         self._rows: dict[tuple[bool, str], int] = {}
-        self._users: dict[Hashable, Body] = {}
         self._known: dict[tuple[int, float], Shape] = {}
         # By user and object, see `_remember_origin`.
         self._came_from: dict[tuple[str, str], Vec] = {}
@@ -144,10 +143,9 @@ class Bodies:
 
     # --- arrivals and departures ---------------------------------------------------------------
 
-    def __setitem__(self, user: Hashable, body: Body) -> None:
-        """Add a user, or update its body's pose."""
+    def put_user(self, body: Body) -> None:
+        """Add a user, by the name of its body, or update its pose."""
         with self.lock:
-            self._users[user] = body
             row = self._rows.get((True, body.name))
             if row is None:
                 self._add(body.name, USER, body.avatar, body.pose)
@@ -155,27 +153,19 @@ class Bodies:
             self.shapes[row] = self.shape_of(body.avatar)
             self._put(row, body.pose)
 
-    def pop(self, user: Hashable) -> None:
+    def remove_user(self, name: str) -> None:
         """Remove a user, if it is present; the numbers of later rows decrease by one."""
         with self.lock:
-            body = self._users.pop(user, None)
-            if body is None:
+            row = self.row_of(name, user=True)
+            if row < 0:
                 return
-            row = self._rows[True, body.name]
             for rows in (self.names, self.shapes, self.changed):
                 del rows[row]  # type: ignore[attr-defined]
             self.kinds = np.delete(self.kinds, row)
             self.poses, self.bounds = np.delete(self.poses, row, axis=0), np.delete(self.bounds, row, axis=0)
             self._rows = {(bool(self.kinds[at] == USER), each): at for at, each in enumerate(self.names)}
-            self._came_from = {key: way for key, way in self._came_from.items() if key[0] != body.name}
+            self._came_from = {key: way for key, way in self._came_from.items() if key[0] != name}
             self.layout += 1
-
-    def is_present(self, body: Body) -> bool:
-        """Return whether this is the body of a present user.
-
-        The body of a move that keeps no state is a different one.
-        """
-        return any(body is known for known in self._users.values())
 
     def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
         """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
@@ -526,7 +516,7 @@ def warm_kernels() -> None:
     poses = [np.eye(4), np.eye(4)]
     poses[1][0, 3] = 1.0
     for name, pose in zip("ab", poses, strict=True):
-        bodies[name] = Body(name, model, pose)
+        bodies.put_user(Body(name, model, pose))
     blocking = BodyObstacle(bodies, USER, Body("a", model, poses[0]))
     blocking.sweep(model, poses[0], poses[1], 1e-6)
     blocking.touches(model, poses[1])

@@ -74,7 +74,8 @@ class Body:
     clear: whether `pose` was found clear, for the archives `generations` (World.generations).
     effect_state: data that effects keep between frames, by effect name.
     user: client and avatar.
-    time, heard: time of its last command, on its own and on the server's clock [s].
+    time, heard: time of its last command, on its own and on the server's clock [s]; time is None before
+    the end of its first frame.
     """
 
     name: str

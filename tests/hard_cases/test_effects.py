@@ -57,7 +57,6 @@ FILES = {
     "report_effects": {"proximity", "contacts", "uncertainty"},
     "uncertainty_effect": {"uncertainty"},
     "body_effects": {"objects", "crowd"},
-    "through_effect": {"through"},
 }
 # Effects whose frames the kernel of walking runs; with `stop` too.
 MOVING = {"sweep", "slide", "ground", "step", "crowd"}

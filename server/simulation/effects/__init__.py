@@ -11,9 +11,8 @@ pipeline in simulation.py runs the effects that a scene declares, in this order:
 5. `ground`: as the last motion, lower the avatar to the ground, or let it fall.
 6. `proximity`, `contacts`, `uncertainty`: report about the final pose.
 
-`through` does nothing in a frame: it changes the scene once, when it is opened.
+`through` does nothing in a frame: archives/masked_store.py leaves its points out of the scene.
 
-May import server.archives, server.avatars, server.queries, server.residency, server.simulation.world,
-schemas.
+May import server.archives, server.avatars, server.queries, server.simulation.world, schemas.
 Begin with motion_effects.py.
 """

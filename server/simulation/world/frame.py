@@ -25,6 +25,9 @@ Matrix = NDArray[np.float64]  # (3, 3), or the upper left of a pose (4, 4)
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
 _QUARTER = 0.5 * math.pi
+# Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
+# on, (6,), and the place where it was raised last, (3,).
+GROUND_PLANE, RAISED = "ground", "ground raised"
 # Limit of the obstacles that an answer lists.
 MAX_TOUCHED = 16
 
@@ -132,7 +135,7 @@ class Frame:
     effect_state: dict[str, Any] = field(default_factory=dict)
     apart: bool = False
     walks: bool = False
-    walk_hits: dict[int, Hit] | None = None
+    walk_hits: dict[int, Hit] = field(default_factory=dict)
     visits: list[int] = field(default_factory=list)
     leaving: Any = None
 

@@ -28,7 +28,7 @@ from ...queries.one_item import MAX_FAST_POINTS
 from ...queries.request import EXACT
 from .collision_world import SPARSE_FACTOR, World, normals_of
 from .first_hits import find_first_hit, find_touched, first_body_hit, is_clear, touches_bodies
-from .frame import Frame, Hit, Pose, Vec, dot, lowest_height, translated
+from .frame import GROUND_PLANE, RAISED, Frame, Hit, Pose, Vec, dot, lowest_height, translated
 
 # Parts of a frame that effects run.
 FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND
@@ -42,9 +42,6 @@ _NEAR_CLEARANCES = 2.0
 _MIN_LIFT = 5e-4
 # Error of a cosine that results from storing normals to a third of a degree.
 _ROUNDING = 0.005
-# Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
-# on, (6,), and the place where it was raised last, (3,).
-GROUND_PLANE, RAISED = "ground", "ground raised"
 # This many consecutive frames in the same voxels count as one use of them: recording one takes a tenth
 # of a query.
 _FRAMES_PER_USE = 16
@@ -143,10 +140,7 @@ class WalkCall:
     """One call of the kernel for a frame: its state to and from arrays, and the answers to its queries."""
 
     def __init__(self, thread: FrameMemory, reaches: tuple[float, ...], frame: Frame) -> None:
-        self._thread, self._reaches, self._frame = thread, reaches, frame
-        if frame.walk_hits is None:
-            frame.walk_hits = {}
-        self._hits: dict[int, Hit] = frame.walk_hits
+        self._thread, self._reaches, self._frame, self._hits = thread, reaches, frame, frame.walk_hits
 
     def begin(self) -> None:
         """Write what the body keeps between frames, and the hits before the first part."""
@@ -199,12 +193,8 @@ class WalkCall:
     def _answer(self, query: int, row: int, to: Pose) -> None:
         """Write the answer of a query to its row. to: end of its motion."""
         frame, tape, question = self._frame, self._thread.tape, self._thread.question
-        world, pose, tolerance, below = (
-            frame.world,
-            frame.pose,
-            question.tolerance.item(),
-            question.below.item(),
-        )
+        world, pose = frame.world, frame.pose
+        tolerance, below = question.tolerance.item(), question.below.item()
         place, level, archive = question.place[0].copy(), question.level.item(), question.archive.item()
         if query == state.SWEPT_TO:
             self._write_hit(row, find_first_hit(frame, to, tolerance, question.skin.item(), below=below))

@@ -1,12 +1,12 @@
 """Simulation: the frames of a scene, which move its users by the effects that the scene declares.
 
-A frame is one step of a user's motion: from the pose that it has, towards the pose that its motion
-command asks for, through the effects in their order (`Pipeline`). `move` simulates one frame and
-keeps no state. `step` simulates one frame of all users with a motion command, and keeps their bodies
-until they end. A `LocalSession` sends it the commands of one user in this process. The same commands
-in the same order give the same poses, bit for bit: a clock is read only to report how long a frame
-took. A frame's deadline is set by who calls `step` (zenoh_server/command_mailboxes.py), as a `stop`
-flag: users that are not simulated by then stay where they are.
+A frame takes a user from its pose towards that of its motion command, through the effects in their
+order (`Pipeline`). `move` simulates one frame and keeps no state. `step` simulates one frame of all
+users with a motion command, and keeps their bodies until they end. A `LocalSession` sends it the
+commands of one user in this process. The same commands in the same order give the same poses, bit for
+bit: a clock is read only to report how long a frame took. The caller of `step` limits its time
+(zenoh_server/command_mailboxes.py): it sets the `stop` flag, and users that have not moved by then stay
+where they are.
 
 Files of effects that the scene does not declare are not imported (NUMERICS.md case 31).
 """

@@ -94,23 +94,17 @@ def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
 
     margin_units: distance between users, exact units.
     """
-    frame.obstacles.append(UserObstacle(bodies, frame, margin_units))
+    met: set[str] = set()
+
+    def count(frame: Frame, hit: Hit, to: Pose) -> bool:
+        met.add(hit.what)
+        frame.reports["crowd"] = CrowdReport(len(met))
+        return False  # users do not give way
+
+    frame.obstacles.append(
+        BodyObstacle(bodies, USER, frame.body, frame.budget.stop, margin_units=margin_units, give_way=count)
+    )
     return CrowdReport()
-
-
-class UserObstacle(BodyObstacle):
-    """Obstacle formed by the other users; it counts those that ended a motion."""
-
-    def __init__(self, bodies: Bodies, frame: Frame, margin_units: int) -> None:
-        """Create the obstacle for one frame of one user."""
-        super().__init__(bodies, USER, frame.body, frame.budget.stop, margin_units=margin_units)
-        self._met: set[str] = set()
-
-    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Count the user that ended the motion; return False, because users do not give way."""
-        self._met.add(hit.what)
-        frame.reports["crowd"] = CrowdReport(len(self._met))
-        return False
 
 
 class ObjectsRunner:
@@ -135,8 +129,36 @@ class ObjectsRunner:
         bodies = self.bodies
         with bodies.lock:
             since, frame.effect_state["objects"] = frame.body.effect_state.get("objects", 0), bodies.clock
-            frame.obstacles.append(ObjectObstacle(self, frame, since))
+            obstacle = BodyObstacle(
+                bodies, KINEMATIC | PUSHED, frame.body, frame.budget.stop, give_way=partial(self._push, since)
+            )
+            frame.obstacles.append(obstacle)
             return self.report(since, frame.budget)
+
+    def _push(self, since: int, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Push the object that ended a motion to `to` by the rest of the way; return whether it moved.
+
+        Only pushable objects move, as far as they touch nothing. A user's first frame and `Simulation.move`,
+        which keeps no state, push no object.
+        since: clock of the last moves reported to the user.
+        """
+        bodies = self.bodies
+        if hit.avatar is None or hit.cloud is None:
+            return False
+        with bodies.lock:
+            row = bodies.row_of(hit.what, user=False)
+            if row < 0 or bodies.kinds[row] != PUSHED or frame.body.time is None:
+                return False
+            left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
+            inward = horizontal(hit.cloud - hit.avatar, bodies.up)
+            if norm(left) < _MIN_PUSH or not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
+                return False
+            pushed = ObjectPush(bodies, row, left, frame).result()
+            if pushed is None or frame.budget.stop:
+                return False  # if stopped, the result may be incomplete
+            bodies.put(row, pushed)
+            frame.reports["objects"] = self.report(since, frame.budget)
+            return True
 
     def report(self, since: int, budget: QueryBudget) -> ObjectsReport:
         """Return the objects that moved since a count of moves, and the contacts."""
@@ -298,36 +320,3 @@ class ObjectPush:
         touches = bodies.touching(shape, frame.pose, rows, 0, frame.budget.stop)
         bodies.poses[self._row] = before
         return bool(touches[0])
-
-
-class ObjectObstacle(BodyObstacle):
-    """Obstacle formed by the objects, for one frame of one user. Pushable objects give way."""
-
-    def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
-        """Create the obstacle for a frame. since: clock of the last moves reported to its user."""
-        super().__init__(runner.bodies, KINEMATIC | PUSHED, frame.body, frame.budget.stop)
-        self._runner, self._since = runner, since
-
-    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Push the object that ended the motion by the rest of the way; return whether it moved.
-
-        Only pushable objects move, as far as they touch nothing. A user's first frame and `Simulation.move`,
-        which keeps no state, push no object.
-        """
-        bodies = self._runner.bodies
-        if hit.avatar is None or hit.cloud is None:
-            return False
-        with bodies.lock:
-            row = bodies.row_of(hit.what, user=False)
-            if row < 0 or bodies.kinds[row] != PUSHED or frame.body.time is None:
-                return False
-            left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
-            inward = horizontal(hit.cloud - hit.avatar, bodies.up)
-            if norm(left) < _MIN_PUSH or not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
-                return False
-            pushed = ObjectPush(bodies, row, left, frame).result()
-            if pushed is None or frame.budget.stop:
-                return False  # if stopped, the result may be incomplete
-            bodies.put(row, pushed)
-            frame.reports["objects"] = self._runner.report(self._since, frame.budget)
-            return True

@@ -319,6 +319,7 @@ class BodyObstacle:
     def __init__(
         self, bodies: Bodies, wanted: int, mover: Body, stop: StopFlag = NO_STOP,
         *, user: bool = True, margin_units: int = 0, skip: str = "",
+        give_way: Callable[[Frame, Hit, Pose], bool] = lambda frame, hit, to: False,
     ) -> None:  # fmt: skip
         """Prepare the obstacle. Its attributes `bodies`, `wanted` and `margin_units` are those given.
 
@@ -326,10 +327,13 @@ class BodyObstacle:
         stop: stop flag of the frame; once it is set, results are meaningless.
         user: whether the mover is a user; False for an object.
         margin_units: distance to keep, exact units.  skip: name of a user that does not block.
+        give_way: moves the body that ended a motion, if possible, and returns whether to try the motion
+        again. Called for each hit; the avatar is at frame.pose, on its way to a pose.
         """
         self.bodies, self.wanted, self.margin_units = bodies, wanted, margin_units
         self._mover, self._user, self._skip, self._stop = mover.name, user, skip, stop
         self._model, self._start = mover.avatar, mover.pose.copy()
+        self.give_way = give_way
         self._layout = bodies.layout
         self._overlapped: dict[int, bool] = {}
 
@@ -394,14 +398,6 @@ class BodyObstacle:
             shape = bodies.shape_of(avatar)
             rows = self._in_reach(shape, pose, pose)
             return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
-
-    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Move the body that ended a motion, if possible; return whether to try the motion again.
-
-        Called for each hit. The avatar is at frame.pose and on its way to `to`. None of these bodies
-        gives way.
-        """
-        return False
 
     def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
         """Return the rows (m,) whose bounds a motion may touch."""

@@ -6,6 +6,7 @@ scenes with it.
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +19,11 @@ from ..schemas.archive.units import UNITS_PER_METRE
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
 from ..schemas.scene.scene_file import SUFFIX, SceneFile
+from ..schemas.wire.requests import AddAvatarRequest
 from ..schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import describe
-from .avatars.avatar_model import describe_avatar, make_avatar
+from .avatars.avatar_model import AvatarModel, describe_avatar, make_avatar
 from .avatars.avatar_shape import avatar_shape
 from .kernels.core.placed_avatar import MAX_REACH_UNITS
 from .residency.arena import ArenaBuffer
@@ -41,10 +43,11 @@ class FoundArchive(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """Avatar that a scene file names. shape: of its file, with its final radius."""
+    """Avatar that a scene file names. shape: of its file, with its final radius.  model: made of it."""
 
     file: Path
     shape: AvatarShape
+    model: AvatarModel
     info: AvatarInfo
 
 
@@ -84,14 +87,16 @@ def read_avatars(file: SceneFile, path: Path) -> list[FoundAvatar]:
                 avatar_file, item.radius, up=item.up, units=item.units, scale=item.scale, hollow=item.hollow
             )
         with error_location(path, f"$.avatars[{number}]"):
-            model = make_avatar(shape.points, shape.radius, shape.inner_points)
+            asked = AddAvatarRequest(item.name, shape.points, shape.radius, shape.inner_points)
+            model = make_avatar(asked.points, asked.radius, asked.inner_points)
             if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
                     "`objects` or `crowd`, under which avatars collide with others"
                 )
         shape = shape._replace(points=model.points, radius=model.radius)
-        found.append(FoundAvatar(avatar_file, shape, describe_avatar(item.name, model, shape.description)))
+        info = describe_avatar(item.name, model, shape.description)
+        found.append(FoundAvatar(avatar_file, shape, model, info))
     return found
 
 
@@ -102,9 +107,10 @@ def store_opener(file: SceneFile, number: int) -> OpenStore:
     """
     for effect in file.effects:
         if isinstance(effect, Through):
-            from .simulation.effects.through_effect import store_without
+            from .archives.masked_store import MaskedStore
 
-            return store_without(effect, file.archives[number].pose)
+            boxes = [(box.low, box.high) for box in effect.boxes]
+            return partial(MaskedStore, boxes=boxes, pose=file.archives[number].pose)
     return VoxelStore
 
 

@@ -56,10 +56,8 @@ ALLOWED = {
     "server/archives": "kernels observability runtime avatars residency queries",
     "server/tiles": "residency archives",
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries archives",
-    "server/simulation/effects": ("runtime avatars residency queries archives simulation/world"),
-    "server/simulation": (
-        "runtime scene_interface.py avatars queries archives simulation/world simulation/effects"
-    ),
+    "server/simulation/effects": "queries archives avatars simulation/world",
+    "server/simulation": "runtime scene_interface.py avatars queries archives simulation/world",
     "server/scene_archives.py": "kernels scene_interface.py avatars residency archives simulation/effects",
     "server/pictures": "avatars archives",
     "server/scene.py": (

@@ -4,7 +4,7 @@ To add an effect:
 
 1. declare its options here as a class, and add it to `AnyEffect` and `ORDER`;
 2. write the function that runs it for a frame, in a file of server/simulation/effects whose function
-   `make` returns it, and name the file in effect_pipeline.py;
+   `make` returns it, and name the file in server/simulation/simulation.py;
 3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in WIRE.md.
 
 The parser of scene files, the pipeline of frames, `info` and `solidcloud scene new` read this

@@ -261,17 +261,23 @@ def make_vectors(vectors: Any, what: str) -> Positions:
     array = float64_array(vectors, what)
     if array.ndim != 2 or array.shape[1] != 3:
         raise BadRequestError(f"{what} of shape {array.shape}: expected (n, 3)")
-    try:
-        check_finite(what, array)
-    except ValueError as error:
-        raise BadRequestError(str(error)) from None
+    _refuse_infinite(what, array)
     return array  # type: ignore[return-value]
 
 
 def check_one_pose(what: str, poses: Poses) -> None:
-    """Raise BadRequestError unless there is exactly one pose."""
+    """Raise BadRequestError unless there is exactly one pose, of finite numbers."""
     if poses.shape != (1, 4, 4):
         raise BadRequestError(f"{what} of shape {poses.shape}: expected one pose, (1, 4, 4), avatar to world")
+    _refuse_infinite(what, poses)
+
+
+def _refuse_infinite(what: str, array: np.ndarray) -> None:
+    """Raise BadRequestError for what `check_finite` refuses: in this process, no decoder checks arrays."""
+    try:
+        check_finite(what, array)
+    except ValueError as error:
+        raise BadRequestError(str(error)) from None
 
 
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], Poses]:

@@ -27,7 +27,7 @@ from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.simulation import Pipeline, make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 
@@ -153,8 +153,7 @@ class Stage:
         ]
         if pipeline.bodies is not None:
             for body in bodies:
-                client, _, avatar = body.name.rpartition("/")
-                pipeline.bodies[client, avatar] = body
+                pipeline.bodies.put_user(body)
         took = np.empty(apart)
         for number in range(apart):
             wishes = [

@@ -13,7 +13,7 @@ from solidcloud.schemas.scene.effect_table import Ground, Slide, Step, Stop, Swe
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.simulation import Pipeline, make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 

@@ -11,7 +11,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.simulation import make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 

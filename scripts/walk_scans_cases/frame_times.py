@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import Pipeline, make_pipeline
-from solidcloud.server.simulation.simulation import target_pose
+from solidcloud.server.simulation.simulation import Pipeline, make_pipeline, target_pose
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 

@@ -127,6 +127,12 @@ class Avatars:
         self._check_same(name, entry, array, radius, inner_points)
         return entry.model
 
+    def put(self, name: str, model: AvatarModel) -> None:
+        """Store an avatar of the scene file."""
+        with self._lock:
+            entry = _Entry(model, model.radius, bytes_of(model))
+            self._clients.setdefault(EVERYBODY, {})[name] = entry
+
     def _build(self, points: NDArray[np.float64], radius: float | None, inner_points: int = 0) -> AvatarModel:
         with self._large if len(points) > _LARGE else nullcontext():
             return make_avatar(points, radius, inner_points)

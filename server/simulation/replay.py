@@ -1,7 +1,7 @@
 """Replay of a log: the same motion commands must give the same poses, bit for bit.
 
 This also holds on another machine: kernels round as NUMERICS.md states, and effects add and
-multiply in a fixed order (vectors.py). Only the probability of `uncertainty` depends on the
+multiply in a fixed order (world/frame.py). Only the probability of `uncertainty` depends on the
 machine's own error function, and no pose depends on it.
 """
 

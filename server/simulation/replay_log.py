@@ -30,7 +30,7 @@ from ...schemas.wire.requests import AddAvatarRequest
 from ..avatars.avatar_model import AvatarModel
 from ..runtime.stop_flag import NO_STOP
 from ..scene_interface import FrameCommand
-from .world.frame import Body, Pose
+from .world.frame import GROUND_PLANE, RAISED, Body, Pose
 
 if TYPE_CHECKING:  # only scenes whose users can collide import it
     from .world.bodies import Bodies
@@ -38,9 +38,8 @@ if TYPE_CHECKING:  # only scenes whose users can collide import it
 log = logging.getLogger(__name__)
 
 MAGIC = b"solidcloud frames 1\n"
-# Names under which the effect `ground` keeps the plane that the avatar stands on and the place where
-# it was raised last.
-_KEPT = ("ground", "ground raised")
+# Entries of `Body.effect_state` on which later poses depend and which no frame computes anew.
+_KEPT = (GROUND_PLANE, RAISED)
 
 Rows = list[list[float]]  # (4, 4), a pose
 
@@ -140,7 +139,6 @@ def take_record(turn: LoggedTurn, body: Body, world: Any, bodies: "Bodies | None
         body.effect_state.pop(name, None)
     body.effect_state.update({name: np.array(value) for name, value in record.kept.items()})
     if bodies is not None:
-        bodies.begin()
         for name, pose in record.pushed.items():
             if (row := bodies.row_of(name, user=False)) >= 0:
                 bodies.put(row, cast(Pose, np.array(pose)))

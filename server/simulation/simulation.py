@@ -1,18 +1,26 @@
 """Simulation: the frames of a scene, which move its users by the effects that the scene declares.
 
-`move` simulates one frame and keeps no state. `step` simulates one frame of all users with a motion
-command, and keeps their bodies until they end. The same commands in the same order give the same
-poses, bit for bit: a clock is read only to report how long a frame took.
+A frame takes a user from its pose towards that of its motion command, through the effects in their
+order (`Pipeline`). `move` simulates one frame and keeps no state. `step` simulates one frame of all
+users with a motion command, and keeps their bodies until they end. A `LocalSession` sends it the
+commands of one user in this process. The same commands in the same order give the same poses, bit for
+bit: a clock is read only to report how long a frame took. The caller of `step` limits its time
+(zenoh_server/command_mailboxes.py): it sets the `stop` flag, and users that have not moved by then stay
+where they are.
+
+Files of effects that the scene does not declare are not imported (NUMERICS.md case 31).
 """
 
+import importlib
 import logging
 import math
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -28,6 +36,7 @@ from ...schemas.errors import (
     SolidcloudError,
     UnknownAvatarError,
 )
+from ...schemas.scene.effect_table import ORDER, effect_name
 from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
@@ -35,24 +44,38 @@ from ...schemas.wire.motion_messages import (
     BOUNDS,
     FRAME_SECONDS,
     WAIT,
+    Late,
     Moved,
     MoveRequest,
     State,
+    Touched,
     Wish,
     checked_late,
 )
 from ...schemas.wire.stats import EffectStats
 from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
-from ..queries.request import LateVoxels, QueryBudget
+from ..queries.request import EXACT, LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
-from ..scene_interface import FrameCommand, FrameResult, recording_avatars
+from ..scene_interface import FrameCommand, FrameResult, Session, recording_avatars
 from .replay_log import FrameLog, LoggedTurn, take_record
-from .world.frame import MAX_TOUCHED, Body, Pose, Vec, translated
-from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
+from .world.frame import (
+    MAX_TOUCHED,
+    Body,
+    Frame,
+    Hit,
+    Pose,
+    Run,
+    Vec,
+    multiply,
+    norm,
+    orthonormalize,
+    rotation_matrix,
+    translated,
+    unit_vector,
+)
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
-    from .effects.effect_pipeline import Pipeline
     from .world.bodies import Bodies
     from .world.collision_world import World
 
@@ -70,19 +93,14 @@ _STOPPED = StopFlag()
 _STOPPED.set("stopped when it was logged")
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
-
-
-@dataclass(slots=True)
-class _Presence:
-    """User in the scene.
-
-    body: its body.  time, heard: time of its last command, on its own and on the server's clock
-    [s].
-    """
-
-    body: Body
-    time: float | None = None
-    heard: float = 0.0
+# The file of each effect.
+_FILES = {
+    "objects": "body_effects", "crowd": "body_effects", "stop": "motion_effects", "sweep": "motion_effects",
+    "slide": "motion_effects", "step": "motion_effects", "ground": "motion_effects",
+    "proximity": "report_effects", "contacts": "report_effects", "uncertainty": "uncertainty_effect",
+}  # fmt: skip
+# Effects that one call runs, in the order of `Frame.visits`.
+_WALKING = ("sweep", "slide", "step", "ground")
 
 
 class Simulation:
@@ -95,7 +113,7 @@ class Simulation:
     def __init__(self, scene: Any, file: SceneFile, pipeline: "Pipeline") -> None:
         self.scene, self.file, self._pipeline = scene, file, pipeline
         self._up = unit_vector(file.up)
-        self._present: dict[User, _Presence] = {}
+        self._present: dict[User, Body] = {}
         self._bodies: Bodies | None = pipeline.bodies
         self._recorder: FrameLog | None = None
         self._frames = 0
@@ -179,7 +197,7 @@ class Simulation:
         """
         with self._frame:
             if now is not None:
-                self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
+                self._remove([u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS])
             self._frames += 1
             outcomes = []
             for number, turn in enumerate(turns):
@@ -193,8 +211,7 @@ class Simulation:
                 used: list[bytes] = []
                 with recording_avatars(used):
                     state = self._simulate_turn(turn, now, budget, was)
-                there = self._present.get(turn.user)
-                body = None if there is None else there.body
+                body = self._present.get(turn.user)
                 outcomes.append(
                     FrameResult(turn.user, state, b"".join(used) if body is None else body.avatar.digest)
                 )
@@ -242,30 +259,28 @@ class Simulation:
         logged: LoggedTurn | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
-        present = self._present.get(user) or self._enter(user, command)
-        body, bodies = present.body, self._bodies
+        body, bodies = self._present.get(user) or self._enter(user, command), self._bodies
         with ExitStack() as undo:  # a command that is refused or stopped changes nothing
             if bodies is not None:
-                undo.callback(bodies.restore, bodies.snapshot())
+                undo.callback(bodies.restorer())
             if command.objects:
                 if bodies is None:
                     raise BadRequestError(
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
-                undo.callback(bodies.place_objects(command.objects, budget.stop))
+                bodies.place_objects(command.objects, budget.stop)
             if logged is None or logged.body is None:
-                durations = frame_durations(command, present.time)
-                if len(durations) > 1:
-                    undo.callback(_restore, body, replace(body, effect_state=dict(body.effect_state)))
+                durations = frame_durations(command, body.time)
+                if len(durations) > 1:  # one that fails leaves the body as it was
+                    body = replace(body, effect_state=dict(body.effect_state))
                 moved = self._run_frames(body, command, durations, budget)
             else:
                 moved = take_record(logged, body, self.world, bodies)
             undo.pop_all()
-        present.time = command.time
-        present.heard = present.heard if now is None else now
-        self._present[user] = present
+        body.time, body.heard = command.time, body.heard if now is None else now
+        self._present[user] = body
         if bodies is not None:
-            bodies[user] = body
+            bodies.put_user(body)
         return moved
 
     def _run_frames(self, body: Body, command: Wish, durations: list[float], budget: QueryBudget) -> Moved:
@@ -273,7 +288,7 @@ class Simulation:
         moves: list[Moved] = []
         for seconds in durations:
             if moves and self._bodies is not None:
-                self._bodies[body.user] = body
+                self._bodies.put_user(body)
             target = target_pose(command, body.pose, seconds, self._up)
             moves.append(self._pipeline.run(body, target, seconds, budget))
         last = moves[-1]
@@ -288,8 +303,8 @@ class Simulation:
             unknown=any(moved.unknown for moved in moves),
         )
 
-    def _enter(self, user: User, command: Wish) -> _Presence:
-        """Return the presence of a new user. Raises BusyError if the scene is full."""
+    def _enter(self, user: User, command: Wish) -> Body:
+        """Return the body of a new user. Raises BusyError if the scene is full."""
         if len(self._present) >= self.most_users:
             raise BusyError(
                 f"{self.scene.name}: {len(self._present)} users are in it, the maximum of its limits: try again later"
@@ -297,7 +312,7 @@ class Simulation:
         avatar = self.scene.avatar(user.avatar, user.client)
         if self._recorder is not None:
             self._recorder.entered(user, avatar)
-        return _Presence(_make_body(user, avatar, first_pose(command, self.file.spawn, self._up)))
+        return _make_body(user, avatar, first_pose(command, self.file.spawn, self._up))
 
     def _remove(self, users: list[User]) -> None:
         """Remove the bodies of users."""
@@ -305,7 +320,7 @@ class Simulation:
         for user in users:
             del self._present[user]
             if self._bodies is not None:
-                self._bodies.pop(user)
+                self._bodies.remove_user(_public_name(user))
         if users and self._recorder is not None:
             self._recorder.frame.ended += users
 
@@ -339,11 +354,11 @@ class Simulation:
                 with self._frame, suppress(SolidcloudError):  # such a frame may be impossible here
                     body = _make_body(user, self.scene.avatar("warm", _WARM), first)
                     if self._bodies is not None:
-                        self._bodies[other] = _make_body(other, body.avatar, (first + last) / 2)
+                        self._bodies.put_user(_make_body(other, body.avatar, (first + last) / 2))
                     for pose in (last, last, first):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
         if self._bodies is not None:
-            self._bodies.pop(other)
+            self._bodies.remove_user(_public_name(other))
         self.scene.forget_client(_WARM)
 
 
@@ -405,16 +420,9 @@ def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
     return check_rigid(command.pose[0].copy(), "pose")
 
 
-def _restore(body: Body, before: Body) -> None:
-    """Restore the state of a body."""
-    for each in fields(body):
-        setattr(body, each.name, getattr(before, each.name))
-
-
 def make_simulation(scene: Any, file: SceneFile) -> Simulation:
     """Return the simulation of a scene's frames, with the effects that `file` declares."""
     # Imported here, because a scene that is only queried needs neither effects nor their kernels.
-    from .effects.effect_pipeline import make_pipeline
     from .world.collision_world import World
 
     return Simulation(scene, file, make_pipeline(file, World(scene, file)))
@@ -430,3 +438,182 @@ def _find_scan_point(world: "World") -> Vec:
         place: Vec = (places if pose is None else transform_points(pose, places))[0]
         hit = world.nearest(place, min(16.0, 2 * lattice.voxel_size))
     return place if hit is None or hit.cloud is None else hit.cloud
+
+
+class Pipeline:
+    """Effects of one scene in their order. Thread-safe, except for two frames of one body.
+
+    world: of the scene.  runs: the effects in order, the names of those that one call runs and the call.
+    """
+
+    def __init__(self, world: "World", runs: Sequence[tuple[Sequence[str], Run]]) -> None:
+        """Create a pipeline; callers use `make_pipeline`."""
+        self.world, self.runs = world, runs
+        self._counts = {name: [0, 0.0] for names, _ in runs for name in names}
+        self._counting = threading.Lock()
+        self._stops = "stop" in self._counts
+
+    @property
+    def bodies(self) -> Any:
+        """Return the `Bodies` of the scene, which the simulation updates; None if no effect needs them."""
+        return self.world.bodies
+
+    def stats(self) -> list[EffectStats]:
+        """Return the frames and seconds of each effect so far, in the order in which they run."""
+        with self._counting:
+            return [EffectStats(name, *count) for name, count in self._counts.items()]  # type: ignore[arg-type]
+
+    def run(
+        self,
+        body: Body,
+        target: Pose,
+        seconds: float = FRAME_SECONDS,
+        budget: QueryBudget = EXACT,
+    ) -> Moved:
+        """Run one frame of a body: move it towards a commanded pose (4, 4), rigid.
+
+        seconds: duration of the frame.
+        Raise BadRequestError for a pose farther than limits.longest_move, the errors of queries, or
+        StoppedError. The body is then unchanged; objects that it pushed are not.
+        """
+        body.pose = np.ascontiguousarray(body.pose, np.float64)
+        target = np.array(target, np.float64, order="C")
+        far, longest = norm(target[:3, 3] - body.pose[:3, 3]), self.world.file.limits.longest_move
+        if not far <= longest:
+            raise BadRequestError(
+                f"the commanded pose is {far:g} m away: expected within {longest:g} m, the scene's longest_move: "
+                "send a nearer pose, or enter the scene there"
+            )
+        frame = Frame(body, target, seconds, self.world, budget, body.pose)
+        frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
+        self.world.begin(budget.stop)
+        self._simulate(frame)
+        body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
+        body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
+        body.effect_state.update(frame.effect_state)
+        return _moved(frame, self.world.unknown)
+
+    def _simulate(self, frame: Frame) -> None:
+        """Run the effects of a frame. Raise StoppedError."""
+        body, budget, world = frame.body, frame.budget, self.world
+        with world as seen:
+            frame.generations = tuple([each.opened.number for each in seen])
+            if not self._stops:
+                frame.pose = frame.target
+            took: list[tuple[str, float]] = []
+            now = time.perf_counter()
+            for names, run in self.runs:
+                if budget.stop:
+                    raise StoppedError
+                report = run(frame)
+                if report is not None:
+                    frame.reports[names[0]] = report
+                frame.simulated += names
+                before, now = now, time.perf_counter()
+                took += _shared_time(names, now - before, frame.visits)
+            with self._counting:
+                for name, seconds in took:
+                    count = self._counts[name]
+                    count[0] += 1
+                    count[1] += seconds
+            if not self._stops:
+                frame.verdict = world.collide(body.avatar, frame.pose, budget)
+            # Bodies that overlap the avatar since the frame's start, such as a placed object, do
+            # not block it, but the verdict reports them.
+            if not frame.apart and any([each.overlaps(body.avatar, frame.pose) for each in frame.obstacles]):
+                frame.verdict = Verdict.CONTACT
+            if budget.stop:  # results of effects from incomplete answers are discarded
+                raise StoppedError
+            world.saw(body.user, body.avatar, frame.pose)
+
+
+def _shared_time(names: Sequence[str], seconds: float, visits: Sequence[int]) -> list[tuple[str, float]]:
+    """Return the time of each effect of a call [s], divided by node visits. visits: by _WALKING."""
+    if len(names) == 1:
+        return [(names[0], seconds)]
+    counts = [visits[_WALKING.index(name)] for name in names]
+    total = sum(counts)
+    shares = [count / total for count in counts] if total else [1.0 / len(names)] * len(names)
+    return [(name, seconds * share) for name, share in zip(names, shares, strict=True)]
+
+
+def _vector(place: Vec) -> tuple[float, float, float]:
+    x, y, z = place.tolist()
+    return x, y, z
+
+
+def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
+    """Return the obstacles that stopped a frame's motions, each position once.
+
+    there: (3,), position of hits without one, world [m].
+    """
+    found: dict[Any, Touched] = {}
+    for hit in hits:
+        place = _vector(there if hit.cloud is None else hit.cloud)
+        normal = None if hit.normal is None else _vector(hit.normal)
+        unknown = hit.verdict == Verdict.UNKNOWN
+        found[hit.what, place] = Touched(place, normal, hit.what, unknown, hit.unloaded)
+    return list(found.values())[:MAX_TOUCHED]
+
+
+def _moved(frame: Frame, unknown: bool) -> Moved:
+    """Return the answer for a frame. unknown: as in `Moved`."""
+    left = norm(frame.remaining)
+    return Moved(
+        pose=frame.pose[None].copy(),
+        verdict=int(frame.verdict),
+        left=left,
+        touched=_touched(frame.hits, frame.pose[:3, 3]) if frame.hits else [],
+        simulated=frame.simulated,
+        **frame.reports,
+        unknown=unknown,
+        unloaded=min(left, max(hit.rest for hit in frame.hits)) if frame.hits else 0.0,
+    )
+
+
+def make_pipeline(file: SceneFile, world: "World") -> Pipeline:
+    """Create the pipeline of a scene: import the file of each declared effect and create the effect."""
+    declared = {effect_name(effect): effect for effect in file.effects}
+    walking = [name for name in _WALKING if name in declared]
+    runs: list[tuple[Sequence[str], Run]] = []
+    for name in ORDER:
+        if name in declared and name not in walking[1:]:
+            make = importlib.import_module(f".effects.{_FILES[name]}", __package__).make
+            runs.append((walking if name in walking else [name], make(declared[name], world)))
+    return Pipeline(world, runs)
+
+
+class LocalSession(Session):
+    """One avatar's session, made by `Scene.session`. A context manager, thread-safe."""
+
+    def __init__(self, simulation: Simulation, user: User, late: Late = "wait") -> None:
+        """Create a session; entering it begins it. late: of its motion commands, as in `Wish`."""
+        super().__init__(simulation.scene.name, user.avatar, late)
+        self._simulation, self._user, self._seq = simulation, user, 0
+
+    def __enter__(self) -> Self:
+        """Begin the session."""
+        self._open = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the scene."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the scene: others may walk where the avatar stood. Closing twice is allowed."""
+        with self._commands:
+            was_open, self._open = self._open, False
+            if was_open:
+                self._simulation.end(self._user)
+        with self._changed:
+            self._changed.notify_all()
+
+    def _next_number(self) -> int:
+        self._seq += 1
+        return self._seq
+
+    def _send(self, wish: Wish) -> None:
+        """Simulate a frame with a motion command."""
+        (outcome,) = self._simulation.step([FrameCommand(self._user, wish)], monotonic())
+        self._keep(outcome.state)

@@ -39,9 +39,8 @@ from solidcloud.server.archives.scene_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import AvatarShape, record_avatar
-from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import FrameLog, LogHead
-from solidcloud.server.simulation.simulation import Simulation
+from solidcloud.server.simulation.simulation import LocalSession, Simulation
 from solidcloud.server.zenoh_server.serve_loop import serve
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 

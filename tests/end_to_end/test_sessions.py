@@ -260,6 +260,6 @@ def test_others_are_told_of_by_another_name_than_their_id(served, endpoint):
     """Test that states hide the ids of other clients: an id permits queries and commands in its name."""
     with walking(endpoint) as session:
         session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
-        ((user, present),) = served._present.items()
-        assert present.body.name == f"{key_expressions.public_id(user.client)}/al"
-        assert present.body.user == user
+        ((user, body),) = served._present.items()
+        assert body.name == f"{key_expressions.public_id(user.client)}/al"
+        assert body.user == user

@@ -53,12 +53,10 @@ ALONE: dict[str, list[str]] = {
 }
 # Files of effects, and the effects for which each is imported.
 FILES = {
-    "stop_effect": {"stop"},
-    "motion_effects": {"sweep", "slide", "ground", "step"},
+    "motion_effects": {"stop", "sweep", "slide", "ground", "step"},
     "report_effects": {"proximity", "contacts", "uncertainty"},
     "uncertainty_effect": {"uncertainty"},
     "body_effects": {"objects", "crowd"},
-    "through_effect": {"through"},
 }
 # Effects whose frames the kernel of walking runs; with `stop` too.
 MOVING = {"sweep", "slide", "ground", "step", "crowd"}
@@ -67,7 +65,6 @@ HELPERS = {
     "server.queries.distance_per_scan": {"uncertainty"},
     "server.archives.masked_store": {"through"},
     "server.simulation.world.bodies": {"objects", "crowd"},
-    "server.simulation.world.body_obstacles": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},
     "server.queries.surface_normals": {"slide", "ground", "step"},
     "server.simulation.world.walker": MOVING,
@@ -90,7 +87,6 @@ import numpy as np
 from solidcloud.schemas.wire.encoding import encode, JSON
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.simulation.world import collision_world as world
-from solidcloud.server.simulation.effects import effect_pipeline
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.simulation import make_simulation
 def child(names):

@@ -1,6 +1,7 @@
 """Two scans and two boxes, and scenes without the points in the boxes, for tests of masked stores."""
 
 import hashlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ import synthetic_scans
 from kept_archives import build_or_copy
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.schemas.scene.effect_table import Through, ThroughBox
+from solidcloud.schemas.scene.effect_table import ThroughBox
+from solidcloud.server.archives.masked_store import MaskedStore
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.through_effect import store_without
 
 STEP = archive_cases.BINARY_STEP
 
@@ -84,4 +85,5 @@ def build(folder: Path, parts: list[NDArray[np.float64]]) -> Path:
 
 def open_without(archive: Path, *boxes: ThroughBox, pose: Any = None, **options: Any) -> Scene:
     """Open a scene without the points in the boxes."""
-    return Scene.open(archive, "hall", open_store=store_without(Through(list(boxes)), pose), **options)
+    masked = partial(MaskedStore, boxes=[(box.low, box.high) for box in boxes], pose=pose)
+    return Scene.open(archive, "hall", open_store=masked, **options)

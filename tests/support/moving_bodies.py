@@ -15,7 +15,7 @@ from solidcloud.schemas.scene.scene_file import ArchiveItem, AvatarItem, ObjectI
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.simulation import Pipeline, make_pipeline
 from solidcloud.server.simulation.world.bodies import Bodies
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
@@ -79,15 +79,15 @@ class Stage:
 
     def enter(self, name: str, model: AvatarModel, pose: NDArray[np.float64]) -> Body:
         """Add a user."""
-        body = self.users[name] = Body(name, model, pose.copy())
-        self.bodies[name] = body
+        body = self.users[name] = Body(name, model, pose.copy(), time=0.0)
+        self.bodies.put_user(body)
         return body
 
     def go(self, name: str, wish: NDArray[np.float64], seconds: float = 1 / 30) -> Moved:
         """Simulate one frame of one user."""
         body = self.users[name]
         moved = self.pipeline.run(body, wish, seconds)
-        self.bodies[name] = body
+        self.bodies.put_user(body)
         return moved
 
     def step(self, name: str, way: Any) -> Moved:

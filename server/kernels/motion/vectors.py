@@ -1,6 +1,6 @@
 """Vectors, points and poses in compiled code. A vector is a tuple of three float64, and may be an array (3,).
 
-The operations and their order are those of server/simulation/world/vectors.py, so that both give the
+The operations and their order are those of server/simulation/world/frame.py, so that both give the
 same bits.
 """
 

@@ -1,8 +1,8 @@
 """Effects of a scene. Only the files of those that a scene declares are imported (NUMERICS.md case 31).
 
 The function `make(effect, world)` of an effect's file returns the function that runs the effect for a
-frame and returns its report, if it has one. The code that effects share is in simulation/world/.
-effect_pipeline.py runs the effects that a scene declares, in this order:
+frame and returns its report, if it has one. The code that effects share is in simulation/world/. The
+pipeline in simulation.py runs the effects that a scene declares, in this order:
 
 1. `objects`, `crowd`: add objects and other users as obstacles, before the avatar moves.
 2. `stop`, with `sweep`: follow the motion command until the first contact.
@@ -11,9 +11,8 @@ effect_pipeline.py runs the effects that a scene declares, in this order:
 5. `ground`: as the last motion, lower the avatar to the ground, or let it fall.
 6. `proximity`, `contacts`, `uncertainty`: report about the final pose.
 
-`through` does nothing in a frame: it changes the scene once, when it is opened.
+`through` does nothing in a frame: archives/masked_store.py leaves its points out of the scene.
 
-May import server.archives, server.avatars, server.queries, server.residency, server.runtime,
-server.simulation.world, schemas.
-Begin with effect_pipeline.py, then stop_effect.py.
+May import server.archives, server.avatars, server.queries, server.simulation.world, schemas.
+Begin with motion_effects.py.
 """

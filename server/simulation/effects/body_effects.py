@@ -5,7 +5,7 @@ Effect `crowd`: users do not walk through one another.
 The other users are obstacles at their current poses. Users whose turn came earlier in this frame
 have already moved; the replay log records the order. A user blocks the others and is not moved by
 them. Users that overlap, for example because they entered at the same place, may separate but not
-move deeper (body_obstacles.py).
+move deeper (bodies.py).
 
 Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
@@ -33,10 +33,8 @@ from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.request import QueryBudget
 from ...queries.scene_data import to_units
-from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
-from ..world.body_obstacles import BodyObstacle, warm_kernels
-from ..world.frame import Frame, Hit, Pose, Run, Vec, lowest_height, translated
-from ..world.vectors import dot, horizontal, norm
+from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
+from ..world.frame import Body, Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 
 # Largest permitted margin of `crowd` [m].
 _MAX_MARGIN = 8.0
@@ -82,16 +80,13 @@ def bodies_of(world: Any) -> Bodies:
     """Return the bodies of a scene, which its effects share. They begin with the objects of its file."""
     if world.bodies is None:
         with world as seen:
-            world.bodies = Bodies(seen[0].data.arrays.origin, world.up, partial(_add_objects, world))
-    bodies: Bodies = world.bodies
-    return bodies
-
-
-def _add_objects(world: Any, bodies: Bodies) -> None:
-    """Add the objects of a scene at their initial poses."""
-    for item in world.file.objects:
-        model = world.avatar(item.avatar)
-        bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+            bodies = Bodies(seen[0].data.arrays.origin, world.up)
+        for item in world.file.objects:
+            model = world.avatar(item.avatar)
+            bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+        world.bodies = bodies
+    found: Bodies = world.bodies
+    return found
 
 
 def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
@@ -99,28 +94,17 @@ def _add_users(bodies: Bodies, margin_units: int, frame: Frame) -> CrowdReport:
 
     margin_units: distance between users, exact units.
     """
-    bodies.begin()
-    frame.obstacles.append(UserObstacle(bodies, frame, margin_units))
+    met: set[str] = set()
+
+    def count(frame: Frame, hit: Hit, to: Pose) -> bool:
+        met.add(hit.what)
+        frame.reports["crowd"] = CrowdReport(len(met))
+        return False  # users do not give way
+
+    frame.obstacles.append(
+        BodyObstacle(bodies, USER, frame.body, frame.budget.stop, margin_units=margin_units, give_way=count)
+    )
     return CrowdReport()
-
-
-class UserObstacle(BodyObstacle):
-    """Obstacle formed by the other users; it counts those that ended a motion."""
-
-    def __init__(self, bodies: Bodies, frame: Frame, margin_units: int) -> None:
-        """Create the obstacle for one frame of one user."""
-        body, stop = frame.body, frame.budget.stop
-        super().__init__(
-            "crowd", bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
-        )
-        self._met: set[str] = set()
-
-    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Count the user that ended the motion; return False, because users do not give way."""
-        if self.is_own(hit):
-            self._met.add(hit.what)
-            frame.reports[self.name] = CrowdReport(len(self._met))
-        return False
 
 
 class ObjectsRunner:
@@ -144,10 +128,37 @@ class ObjectsRunner:
         """
         bodies = self.bodies
         with bodies.lock:
-            bodies.begin()
             since, frame.effect_state["objects"] = frame.body.effect_state.get("objects", 0), bodies.clock
-            frame.obstacles.append(ObjectObstacle(self, frame, since))
+            obstacle = BodyObstacle(
+                bodies, KINEMATIC | PUSHED, frame.body, frame.budget.stop, give_way=partial(self._push, since)
+            )
+            frame.obstacles.append(obstacle)
             return self.report(since, frame.budget)
+
+    def _push(self, since: int, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Push the object that ended a motion to `to` by the rest of the way; return whether it moved.
+
+        Only pushable objects move, as far as they touch nothing. A user's first frame and `Simulation.move`,
+        which keeps no state, push no object.
+        since: clock of the last moves reported to the user.
+        """
+        bodies = self.bodies
+        if hit.avatar is None or hit.cloud is None:
+            return False
+        with bodies.lock:
+            row = bodies.row_of(hit.what, user=False)
+            if row < 0 or bodies.kinds[row] != PUSHED or frame.body.time is None:
+                return False
+            left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
+            inward = horizontal(hit.cloud - hit.avatar, bodies.up)
+            if norm(left) < _MIN_PUSH or not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
+                return False
+            pushed = ObjectPush(bodies, row, left, frame).result()
+            if pushed is None or frame.budget.stop:
+                return False  # if stopped, the result may be incomplete
+            bodies.put(row, pushed)
+            frame.reports["objects"] = self.report(since, frame.budget)
+            return True
 
     def report(self, since: int, budget: QueryBudget) -> ObjectsReport:
         """Return the objects that moved since a count of moves, and the contacts."""
@@ -196,8 +207,8 @@ class ObjectPush:
         self._world, self._budget, self._pusher = pusher.world, pusher.budget, pusher
         self._model, self._pose = bodies.shapes[row].model, bodies.poses[row].copy()
         self._others = BodyObstacle(
-            "objects", bodies, USER | KINEMATIC | PUSHED, bodies.names[row], self._model, self._pose,
-            user=False, skip=user, stop=pusher.budget.stop,
+            bodies, USER | KINEMATIC | PUSHED, Body(bodies.names[row], self._model, self._pose), pusher.budget.stop,
+            user=False, skip=user,
         )  # fmt: skip
 
     def result(self) -> Pose | None:
@@ -309,39 +320,3 @@ class ObjectPush:
         touches = bodies.touching(shape, frame.pose, rows, 0, frame.budget.stop)
         bodies.poses[self._row] = before
         return bool(touches[0])
-
-
-class ObjectObstacle(BodyObstacle):
-    """Obstacle formed by the objects, for one frame of one user. Pushable objects give way."""
-
-    def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
-        """Create the obstacle for a frame. since: clock of the last moves reported to its user."""
-        body, stop = frame.body, frame.budget.stop
-        super().__init__(
-            "objects", runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
-        )
-        self._runner, self._since = runner, since
-
-    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Push the object that ended the motion by the rest of the way; return whether it moved.
-
-        Only pushable objects move, as far as they touch nothing. `Simulation.move`, which keeps no state,
-        pushes no object.
-        """
-        bodies = self._runner.bodies
-        if not self.is_own(hit) or hit.avatar is None or hit.cloud is None:
-            return False
-        with bodies.lock:
-            row = bodies.row_of(hit.what, user=False)
-            if row < 0 or bodies.kinds[row] != PUSHED or not bodies.is_present(frame.body):
-                return False
-            left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
-            inward = horizontal(hit.cloud - hit.avatar, bodies.up)
-            if norm(left) < _MIN_PUSH or not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
-                return False
-            pushed = ObjectPush(bodies, row, left, frame).result()
-            if pushed is None or frame.budget.stop:
-                return False  # if stopped, the result may be incomplete
-            bodies.put(row, pushed)
-            frame.reports[self.name] = self._runner.report(self._since, frame.budget)
-            return True

@@ -29,16 +29,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_table import Uncertainty
 from ....schemas.wire.motion_messages import UncertaintyReport
 from ....schemas.wire.scene_messages import SceneInfo, SourceInfo
 from ...archives.rigid_transform import transform_poses
-from ...avatars.avatar_model import make_avatar
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
 from ...queries.one_item import distance_fast
 from ..world.frame import Frame, Run
@@ -140,13 +136,7 @@ def scans_of(effect: Uncertainty, sources: Sequence[SourceInfo]) -> ArchiveScans
 
 
 def make(effect: Uncertainty, world: Any) -> Run:
-    """Create the effect of a scene, and compile its kernel before the first frame near something."""
-    nowhere = np.eye(4)
-    nowhere[:3, 3] = MAX_COORDINATE / 2
-    with world as seen:
-        for each in seen:
-            if each.data.keeps_scan:
-                separation_per_scan(each.data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
+    """Create the effect of a scene."""
     return UncertaintyRunner(effect).run
 
 

@@ -6,7 +6,7 @@ generations that it holds, the cost of its queries, and whether an answer was in
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -36,8 +36,7 @@ from ...queries.request import EXACT, QueryBudget
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
-from .frame import Hit, Pose, Vec
-from .vectors import min_height, unit_vector
+from .frame import Hit, Pose, Vec, min_height, unit_vector
 
 _Answers = TypeVar("_Answers", CollideAnswers, ContactsAnswers, DistanceAnswers, SweepAnswers, WithinAnswers)
 
@@ -57,9 +56,7 @@ class _Held(threading.local):
     visits = 0
     stop: StopFlag = NO_STOP
     unknown = False
-
-    def __init__(self) -> None:
-        self.archives: list[HeldArchive] = []
+    archives: Sequence[HeldArchive] = ()
 
 
 class World:
@@ -81,7 +78,7 @@ class World:
         self.is_alone = len(self.archives) == 1 and self.archives[0].pose is None
         self._held = _Held()
 
-    def __enter__(self) -> list[HeldArchive]:
+    def __enter__(self) -> Sequence[HeldArchive]:
         """Hold the current archive generations, which this thread queries inside the `with`."""
         held = self._held
         if not held.depth:
@@ -94,7 +91,7 @@ class World:
         held = self._held
         held.depth -= 1
         if not held.depth:
-            archives, held.archives = held.archives, []
+            archives, held.archives = held.archives, ()
             release(archives)
 
     def begin(self, stop: StopFlag) -> None:
@@ -143,12 +140,11 @@ class World:
         least = np.inf
         with self as held:
             for each in held:
-                arrays = each.data.arrays
+                arrays, radius = each.data.arrays, each.data.radius_units / UNITS_PER_METRE
                 box = each.data.tree.scene * arrays.step + arrays.origin
-                corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
+                corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
                 if each.placed.pose is not None:
                     corners = transform_points(each.placed.pose, corners)
-                radius = each.data.radius_units / UNITS_PER_METRE
                 least = min(least, min_height(corners, self.up) - radius)
         return least
 
@@ -203,19 +199,18 @@ class World:
         self,
         avatar: AvatarModel,
         pose: Pose,
-        limit: int = 100,
+        limit: int,
         margin: float = 0.0,
         cluster_distance: float | None = None,
         budget: QueryBudget = EXACT,
-    ) -> ContactsAnswers:
-        """Return the contacts at a pose; see server/queries/contacts.py. limit: of each archive."""
-        return self._contacts(avatar, pose, limit, margin, cluster_distance, budget)[0]
+    ) -> tuple[ContactsAnswers, int]:
+        """Return the contacts at a pose (server/queries/contacts.py), and the archive of the deepest one.
 
-    def _contacts(self, avatar: AvatarModel, pose: Pose, *how: Any) -> tuple[ContactsAnswers, int]:
-        """Return the contacts at a pose, and the archive of the deepest one. how: as for `contacts`."""
-        poses = pose[None]
+        limit: of each archive.
+        """
+        poses, how = pose[None], (limit, margin, cluster_distance, budget)
         return self._ask(
-            how[-1],
+            budget,
             lambda each: contacts(each.data, avatar, each.placed.poses_in(poses), *how),
             "signed_distance",
             "cloud_point",
@@ -224,7 +219,7 @@ class World:
 
     def deepest(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Hit | None:
         """Return the deepest contact at a pose, with fraction 0, or None."""
-        found, number = self._contacts(avatar, pose, 1, 0.0, None, budget)
+        found, number = self.contacts(avatar, pose, 1, budget=budget)
         if not len(found.signed_distance):
             return None
         return Hit(0.0, Verdict.CONTACT, found.avatar_point[0], found.cloud_point[0], "", number)
@@ -279,16 +274,8 @@ class World:
         lower, upper = found.lower.item(0), found.upper.item(0)
         if verdict == Verdict.UNKNOWN:
             return Hit(lower, verdict, None, None, exact=exact)
-        return Hit(
-            lower,
-            verdict,
-            found.witness_avatar[0],
-            found.witness_cloud[0],
-            "",
-            number,
-            upper=upper,
-            exact=exact,
-        )
+        own, cloud = found.witness_avatar[0], found.witness_cloud[0]
+        return Hit(lower, verdict, own, cloud, "", number, upper=upper, exact=exact)
 
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float

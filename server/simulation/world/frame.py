@@ -1,4 +1,11 @@
-"""One frame of one user: its state, the hits that end motions, and the motions of effects."""
+"""One frame of one user: its state, the hits that end motions, and arithmetic of poses and vectors.
+
+Vectors and rotations are computed with Python's floats, or by numpy element by element, in a fixed
+order of operations. numpy multiplies matrices with a library whose order of sums and use of fused
+operations depend on the processor: the same motion commands could give other poses on another
+machine. No library guarantees the bits of a sine either. For three numbers this is also faster: a
+product by numpy takes a microsecond. kernels/motion/vectors.py has the same in compiled code.
+"""
 
 import math
 from collections.abc import Callable
@@ -10,12 +17,17 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
+from ...kernels.motion.screw_motion import sine_cosine
 from ...queries.request import EXACT, QueryBudget
-from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
+Matrix = NDArray[np.float64]  # (3, 3), or the upper left of a pose (4, 4)
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
+_QUARTER = 0.5 * math.pi
+# Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
+# on, (6,), and the place where it was raised last, (3,).
+GROUND_PLANE, RAISED = "ground", "ground raised"
 # Limit of the obstacles that an answer lists.
 MAX_TOUCHED = 16
 
@@ -36,6 +48,7 @@ class Hit(NamedTuple):
     not known.
     upper: fraction at which it certainly touches; inf if not known.  exact: whether no other contact
     can come first, and no avatar point moves farther than the tolerance from `fraction` to `upper`.
+    obstacle: the `BodyObstacle` (bodies.py) that was hit, or None.
     """
 
     fraction: float
@@ -51,6 +64,7 @@ class Hit(NamedTuple):
     end: Pose | None = None
     upper: float = math.inf
     exact: bool = True
+    obstacle: Any = None
 
 
 @dataclass(slots=True)
@@ -63,6 +77,8 @@ class Body:
     clear: whether `pose` was found clear, for the archives `generations` (World.generations).
     effect_state: data that effects keep between frames, by effect name.
     user: client and avatar.
+    time, heard: time of its last command, on its own and on the server's clock [s]; time is None before
+    the end of its first frame.
     """
 
     name: str
@@ -74,6 +90,8 @@ class Body:
     generations: tuple[int, ...] = ()
     effect_state: dict[str, Any] = field(default_factory=dict)
     user: tuple[str, str] = ("", "")
+    time: float | None = None
+    heard: float = 0.0
 
 
 @dataclass(slots=True)
@@ -88,14 +106,14 @@ class Frame:
     clear: whether nothing is touched at `pose`.
     remaining: (3,), part of the commanded translation that is not completed yet [m].
     hits: hits that ended motions, in order.
-    obstacles: besides the scan, each a `BodyObstacle` (body_obstacles.py).
+    obstacles: besides the scan, each a `BodyObstacle` (bodies.py).
     fall_speed, on_ground: new values of `Body`.
     simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     apart: whether it is proved that no obstacle is touched at `pose`.
     walks, walk_hits: for walker.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
-    leaving: the last pose in contact from which a motion began (leaving.py), or None.
+    leaving: the last pose in contact from which a motion began (first_hits.py), or None.
     """
 
     body: Body
@@ -117,7 +135,7 @@ class Frame:
     effect_state: dict[str, Any] = field(default_factory=dict)
     apart: bool = False
     walks: bool = False
-    walk_hits: dict[int, Hit] | None = None
+    walk_hits: dict[int, Hit] = field(default_factory=dict)
     visits: list[int] = field(default_factory=list)
     leaving: Any = None
 
@@ -130,6 +148,81 @@ class Frame:
 # An effect of a scene: runs it for one frame, and returns its report, if it has one. It stores the
 # state of a user only in `Body`. The function `make(effect, world)` of an effect's file returns it.
 Run = Callable[[Frame], Any]
+
+
+def dot(one: Vec, other: Vec) -> float:
+    """Return the dot product of two vectors (3,)."""
+    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
+    return float(a * x + b * y + c * z)
+
+
+def norm(vector: Vec) -> float:
+    """Return the length of a vector (3,)."""
+    return math.sqrt(dot(vector, vector))
+
+
+def unit_vector(vector: tuple[float, float, float]) -> Vec:
+    """Return the direction of a vector that is not zero."""
+    found = np.array(vector, np.float64)
+    return found / norm(found)
+
+
+def horizontal(vector: Vec, up: Vec) -> Vec:
+    """Return the part of a vector that is perpendicular to a unit vector."""
+    flat: Vec = vector - dot(vector, up) * up
+    return flat
+
+
+def rotate(rotation: Matrix, vector: Vec) -> Vec:
+    """Return rotation @ vector."""
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rotation[:3].tolist())
+    x, y, z = vector.tolist()
+    return np.array([a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z])
+
+
+def rotate_back(rotation: Matrix, vector: Vec) -> Vec:
+    """Return vector @ rotation, which inverts `rotate`."""
+    return rotate(rotation[:3, :3].T, vector)
+
+
+def multiply(one: Matrix, other: Matrix) -> Matrix:
+    """Return the product (3, 3) of two matrices."""
+    return np.column_stack([rotate(one, other[:3, column]) for column in range(3)])
+
+
+def frobenius_norm(matrix: Matrix) -> float:
+    """Return the Frobenius norm of a matrix (3, 3), which bounds its largest singular value."""
+    square = 0.0  # `sum` adds the rounding errors too, from Python 3.12 on
+    for row in matrix.tolist():
+        for x in row[:3]:
+            square += x * x
+    return math.sqrt(square)
+
+
+def min_height(points: NDArray[np.float64], up: Vec) -> float:
+    """Return the least height of points (n, 3) along a direction; n > 0."""
+    x, y, z = up.tolist()
+    return float((points[:, 0] * x + points[:, 1] * y + points[:, 2] * z).min())
+
+
+def rotation_matrix(axis: Vec, angle: float) -> Matrix:
+    """Return the rotation (3, 3) about a unit vector by an angle [rad], by Rodrigues' formula."""
+    quarters = math.floor(angle / _QUARTER)
+    s, c = sine_cosine(min(max(angle - quarters * _QUARTER, 0.0), _QUARTER))
+    for _ in range(quarters % 4):
+        s, c = c, -s
+    x, y, z = axis.tolist()
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + s * cross + (1.0 - c) * multiply(cross, cross)
+
+
+def orthonormalize(rotation: Matrix) -> Matrix:
+    """Return a rotation without the rounding errors that products of many rotations accumulate."""
+    first = rotation[:, 0] / norm(rotation[:, 0])
+    second = rotation[:, 1] - first * dot(first, rotation[:, 1])
+    second /= norm(second)
+    (a, b, c), (x, y, z) = first.tolist(), second.tolist()
+    return np.column_stack([first, second, [b * z - c * y, c * x - a * z, a * y - b * x]])
 
 
 def translated(pose: Pose, way: Vec) -> Pose:
@@ -150,66 +243,3 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
 def is_translation(pose: Pose, to: Pose) -> bool:
     """Return whether two poses have the same orientation, bit for bit."""
     return pose[:3, :3].tobytes() == to[:3, :3].tobytes()
-
-
-def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, below: bool) -> Hit | None:
-    """Return the first hit of the motion from frame.pose to a pose with obstacles, before `until`.
-
-    until: fraction of the motion.  below: as for `find_first_hit`.
-    """
-    found = None
-    for obstacle in frame.obstacles:
-        hit = obstacle.sweep(frame.body.avatar, frame.pose, to, tolerance, below=below)
-        if hit is not None and hit.fraction < until:
-            found, until = hit, hit.fraction
-    return found
-
-
-def find_touched(frame: Frame, pose: Pose) -> Hit | None:
-    """Return a hit with fraction 0 if a pose touches something or is unknown, or None."""
-    avatar, lacked = frame.body.avatar, frame.lacked
-    verdict = frame.world.collide(avatar, pose, frame.budget)
-    if verdict == Verdict.CONTACT:
-        return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
-    if verdict == Verdict.UNKNOWN:
-        return Hit(0.0, verdict, None, None, unloaded=frame.lacked > lacked)
-    return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
-
-
-def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
-    """Return whether it is known that nothing is touched at a pose.
-
-    proved: whether this is already proved for the scene; then only obstacles are tested.
-    """
-    avatar = frame.body.avatar
-    if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
-        return False
-    return not touches_bodies(frame, pose)
-
-
-def touches_bodies(frame: Frame, pose: Pose) -> bool:
-    """Return whether an obstacle is touched at a pose."""
-    return any(each.touches(frame.body.avatar, pose) for each in frame.obstacles)
-
-
-def max_displacement(frame: Frame, to: Pose) -> float:
-    """Return an approximate bound of the distance that any avatar point moves to a pose [m].
-
-    The motion begins at frame.pose.
-    """
-    avatar, begin = frame.body.avatar, frame.pose
-    if not len(avatar.points):
-        return 0.0
-    way = to[:3, 3] - begin[:3, 3]
-    if is_translation(begin, to):
-        return norm(way)
-    turn = to[:3, :3] - begin[:3, :3]
-    center = way + rotate(turn, avatar.arrays.center[0])
-    return norm(center) + frobenius_norm(turn) * float(avatar.arrays.radius[0])
-
-
-def record_hit(frame: Frame, hit: Hit) -> None:
-    """Record a hit where the frame begins."""
-    frame.hits.append(hit)
-    if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
-        frame.verdict = Verdict.UNKNOWN

@@ -27,20 +27,8 @@ from ...kernels.walk.walk_frame import walk_frame
 from ...queries.one_item import MAX_FAST_POINTS
 from ...queries.request import EXACT
 from .collision_world import SPARSE_FACTOR, World, normals_of
-from .frame import (
-    Frame,
-    Hit,
-    Pose,
-    Vec,
-    find_touched,
-    first_body_hit,
-    is_clear,
-    lowest_height,
-    touches_bodies,
-    translated,
-)
-from .leaving import find_first_hit
-from .vectors import dot
+from .first_hits import find_first_hit, find_touched, first_body_hit, is_clear, touches_bodies
+from .frame import GROUND_PLANE, RAISED, Frame, Hit, Pose, Vec, dot, lowest_height, translated
 
 # Parts of a frame that effects run.
 FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND
@@ -54,9 +42,6 @@ _NEAR_CLEARANCES = 2.0
 _MIN_LIFT = 5e-4
 # Error of a cosine that results from storing normals to a third of a degree.
 _ROUNDING = 0.005
-# Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
-# on, (6,), and the place where it was raised last, (3,).
-GROUND_PLANE, RAISED = "ground", "ground raised"
 # This many consecutive frames in the same voxels count as one use of them: recording one takes a tenth
 # of a query.
 _FRAMES_PER_USE = 16
@@ -155,10 +140,7 @@ class WalkCall:
     """One call of the kernel for a frame: its state to and from arrays, and the answers to its queries."""
 
     def __init__(self, walker: "Walker", thread: FrameMemory, frame: Frame) -> None:
-        self._walker, self._thread, self._frame = walker, thread, frame
-        if frame.walk_hits is None:
-            frame.walk_hits = {}
-        self._hits: dict[int, Hit] = frame.walk_hits
+        self._walker, self._thread, self._frame, self._hits = walker, thread, frame, frame.walk_hits
 
     def begin(self) -> None:
         """Write how the frame begins: what the body keeps between frames, and the hits before the first part."""
@@ -239,7 +221,7 @@ class WalkCall:
             self._write_hit(row, find_touched(frame, pose))
         elif query == state.GIVES_WAY:
             hit = self._hits[question.hit.item()]
-            tape.answer[row] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
+            tape.answer[row] = hit.obstacle is not None and hit.obstacle.give_way(frame, hit, to)
         elif query == state.NORMAL_AT:
             toward, reach = question.toward[0].copy(), self._walker.reaches[level]
             normal = world.normal_at(archive, place, toward, reach, frame.budget)

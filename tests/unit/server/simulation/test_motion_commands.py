@@ -1,13 +1,16 @@
 """What a wish asks of a frame: poses are checked, velocities last for the frame, nobody jumps after a pause."""
 
 import math
+import re
 
+import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas.archive.rigid_pose import check_rigid
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
-from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Wish
+from solidcloud.schemas.wire.encoding import MSGPACK, decode_request
+from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
 from solidcloud.server.simulation.simulation import (
     LONGEST_FRAME,
     LONGEST_PAUSE,
@@ -15,7 +18,7 @@ from solidcloud.server.simulation.simulation import (
     frame_durations,
     target_pose,
 )
-from solidcloud.server.simulation.world.vectors import rotation_matrix
+from solidcloud.server.simulation.world.frame import rotation_matrix
 
 pytestmark = pytest.mark.interpreted
 
@@ -98,7 +101,6 @@ def test_users_begin_at_the_spawn_or_where_they_say():
         (lambda pose: pose.__setitem__((0, 1), 1e-8), "not rigid"),
         (lambda pose: pose.__setitem__((2, 2), -1.0), "mirrors"),
         (lambda pose: pose.__setitem__((slice(3), slice(3)), 0.0), "not rigid"),
-        (lambda pose: pose.__setitem__((1, 1), np.nan), "off by nan"),
     ],
 )
 def test_what_is_not_rigid_is_refused(change, said):
@@ -109,6 +111,30 @@ def test_what_is_not_rigid_is_refused(change, said):
         check_rigid(pose, "pose")
     with pytest.raises(BadTransformError, match=said):
         target_pose(wish(pose), np.eye(4), 0.1, UP)
+
+
+def test_a_pose_of_nan_is_not_rigid():
+    pose = pose_at(1.0, 2.0, 3.0)
+    pose[1, 1] = np.nan
+    with pytest.raises(BadTransformError, match="off by nan"):
+        check_rigid(pose, "pose")
+
+
+@pytest.mark.parametrize("place", [(1, 1), (0, 3), (3, 3)])
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_poses_of_a_frame_are_finite_in_this_process_as_over_the_wire(place, number):
+    """A pose has the same error as when it is decoded."""
+    pose = pose_at(1.0, 2.0, 3.0)[None]
+    good = pose.copy()
+    pose[0, *place] = number
+    said = re.escape(f"[0, {place[0]}, {place[1]}] is {number}, expected finite numbers")
+    with pytest.raises(BadRequestError, match="pose" + said):
+        Wish(seq=0, time=0.0, pose=pose)
+    with pytest.raises(BadRequestError, match="pose_to" + said):
+        MoveRequest(avatar="al", pose_from=good, pose_to=pose)
+    raw = msgspec.msgpack.encode({"seq": 0, "time": 0.0, "pose": pose.tobytes()})
+    with pytest.raises(BadRequestError, match="pose" + said):
+        decode_request(Wish, raw, MSGPACK)
 
 
 @pytest.mark.parametrize(

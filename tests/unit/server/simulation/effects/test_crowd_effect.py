@@ -111,7 +111,7 @@ def test_a_thin_body_is_met_at_fifty_metres_a_frame(tmp_path: Path) -> None:
         ):
             body = stage.enter("c/walker", SMALL, start)
             stage.users["c/leaf"].pose = at(0.5, 0, start[2, 3])
-            stage.bodies["c/leaf"] = stage.users["c/leaf"]
+            stage.bodies.put_user(stage.users["c/leaf"])
             stage.go("c/walker", wish)
             assert abs(body.pose[0, 3] - 0.5) < 0.26, "it stands before the leaf"
             assert (body.pose[0, 3] > 0.5) == (start[0, 3] > 0.5), "on its own side"

@@ -18,8 +18,8 @@ from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.simulation.effects import stop_effect
-from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.effects import motion_effects
+from solidcloud.server.simulation.simulation import make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
@@ -165,7 +165,9 @@ def test_alone_it_moves_like_the_kernel_that_other_effects_need(
             world = World(SimpleNamespace(archives=archives), game.world.file)
             plays.append(Play(game.scene, world, make_pipeline(game.world.file, world)))
             if not alone:
-                plays[-1].pipeline.runs = [(["stop"], stop_effect.StopRunner(world, Stop(), walks=True).run)]
+                plays[-1].pipeline.runs = [
+                    (["stop"], motion_effects.StopRunner(world, Stop(), walks=True).run)
+                ]
         for turn in range(30):
             avatar = (BALL, effect_rooms.person())[turn % 2]
             start = at(*rng.uniform(-0.5, 0.5, 3) * [0.5, 1.0, 1.0], angle=rng.uniform(0, 6))

@@ -13,7 +13,7 @@ from solidcloud.schemas.scene.effect_table import AnyEffect, Ground, Slide, Step
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.simulation import make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 

@@ -9,7 +9,7 @@ import pytest
 from effect_rooms import INTERPRETED, Play
 from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.encoding import encode
-from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.simulation import make_pipeline
 from solidcloud.server.simulation.world import walker
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body

@@ -13,11 +13,11 @@ from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects import stop_effect
-from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.effects import motion_effects
+from solidcloud.server.simulation.simulation import make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.first_hits import leave
 from solidcloud.server.simulation.world.frame import Body, Frame
-from solidcloud.server.simulation.world.leaving import leave
 
 EFFECTS: list[AnyEffect] = [Stop(), Sweep(), Slide(), Step(), Ground()]
 WAYS = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(8) * np.pi / 4]
@@ -63,7 +63,7 @@ def test_who_overlaps_a_thin_wall_leaves_it_and_never_through(
     Without `pops`, only motion commands lead out.
     """
     if not pops:
-        monkeypatch.setattr(stop_effect, "_ESCAPE_DISTANCES", ())
+        monkeypatch.setattr(motion_effects, "_ESCAPE_DISTANCES", ())
     case = effect_rooms.build(tmp_path, walls(shape, rng, 0.002))
     avatar, reach = shell(), WIDE + SPHERE + RADIUS
     with play(case.archive, Stop(), Sweep(), Slide()) as game:
@@ -160,7 +160,7 @@ def test_who_stands_in_the_floor_is_lifted_and_walks(tmp_path: Path) -> None:
 def test_a_turn_waits_until_the_user_is_out(
     tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, effects: list[AnyEffect]
 ) -> None:
-    monkeypatch.setattr(stop_effect, "_ESCAPE_DISTANCES", ())
+    monkeypatch.setattr(motion_effects, "_ESCAPE_DISTANCES", ())
     case = effect_rooms.build(tmp_path, walls("sheet", rng, 0.0))
     with play(case.archive, *effects) as game:
         body = game.body(shell(), at(0, -0.15, 0))
@@ -176,7 +176,7 @@ def test_a_turn_waits_until_the_user_is_out(
 def test_walls_of_two_archives_hold_a_user_alike(
     tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stop_effect, "_ESCAPE_DISTANCES", ())
+    monkeypatch.setattr(motion_effects, "_ESCAPE_DISTANCES", ())
     sheet = effect_rooms.build(tmp_path, walls("sheet", rng, 0.0)).archive
     turned = at(0.25, 0, 0, np.pi / 2).tolist()
     archives = [ArchiveItem(path=str(sheet)), ArchiveItem(path=str(sheet), pose=turned)]

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from solidcloud.server.simulation.world.vectors import (
+from solidcloud.server.simulation.world.frame import (
     dot,
     frobenius_norm,
     horizontal,

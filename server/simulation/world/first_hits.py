@@ -1,10 +1,10 @@
-"""First hits of motions, and motions that begin in contact with the scan.
+"""First hits of a frame's motions with the scan and other bodies, and motions that begin in contact.
 
-The rule for those is in schemas/SCENE.md, "A user in contact".
+The rule for the latter is in schemas/SCENE.md, "A user in contact".
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...archives.ask_archives import HeldArchive
 from ...archives.rigid_transform import transform_points
-from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
 from ...kernels.motion.sweep_resident import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
 from ...queries.request import QueryBudget, parts_that_fit
@@ -22,13 +21,14 @@ from .frame import (
     Hit,
     Pose,
     Vec,
-    first_body_hit,
-    is_clear,
+    dot,
+    frobenius_norm,
     is_translation,
-    max_displacement,
+    norm,
+    rotate,
+    rotate_back,
     translated,
 )
-from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
@@ -45,39 +45,26 @@ _ROUNDING = 1e-8
 _FIRST_STEP_BACK, _STEP_GROWTH = 1e-7, 4.0
 
 
-class _Gathered(NamedTuple):
-    """Points of an archive, as `gather_points` has them.
-
-    lacks: whether part of the scan there is unknown.  late: number of voxels not in memory.
-    """
-
-    points: NDArray[np.float64]
-    lacks: bool = False
-    late: int = 0
-
-
 class LeavingPose:
     """Pose in contact with the scan, and the motions that may leave it.
 
     Scan points that the avatar holds, by touching them or inside, bound these motions by planes
     between them and its core. All other points stop a motion at their first contact.
+
+    reach: translations of `pose` by up to this length may meet the gathered points [m].
+    lacks: whether part of the scan there is unknown.  late: whether voxels are not in memory.
     """
 
     def __init__(self, frame: Frame, reach: float) -> None:
         """Gather the points that translations of frame.pose by up to `reach` [m] may meet."""
-        self.pose, self.reach = frame.pose, reach
-        world, avatar, budget = frame.world, frame.body.avatar, frame.budget
-        self._body = avatar.reference
-        with world as seen:
+        self.pose, self.reach, self.lacks, self.late = frame.pose, reach, False, False
+        avatar, self._body = frame.body.avatar, frame.body.avatar.reference
+        with frame.world as seen:
             self._seen = list(seen)
-            found = [
-                self._gather(each, avatar, each.placed.poses_in(frame.pose[None])[0], budget) for each in seen
-            ]
-        budget.lacked(sum(each.late for each in found))
-        self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
-        world.count(0, self.lacks)
-        points = np.concatenate([each.points for each in found])
-        self._archive = np.repeat(np.arange(len(found)), [len(each.points) for each in found])
+            found = [self._gather(each, reach + avatar.radius, frame.budget) for each in seen]
+        frame.world.count(0, self.lacks)
+        points = np.concatenate(found)
+        self._archive = np.repeat(np.arange(len(found)), [len(each) for each in found])
         units = np.array([each.data.radius_units for each in self._seen])[self._archive]
         self._reach = avatar.radius + (units - points[:, kernel.DEFICIT]) / UNITS_PER_METRE
         self._points = np.ascontiguousarray(points[:, : kernel.LATTICE])
@@ -94,14 +81,11 @@ class LeavingPose:
         self._planes = planes[: max(count, 0)]
         self._blocked = count < 0
 
-    def _gather(self, seen: HeldArchive, avatar: AvatarModel, pose: Pose, budget: QueryBudget) -> _Gathered:
-        """Return the points of an archive that an avatar may meet within the reach.
-
-        pose: (4, 4), avatar to archive.
-        """
-        data, residency = seen.data, seen.data.residency
+    def _gather(self, seen: HeldArchive, far: float, budget: QueryBudget) -> NDArray[np.float64]:
+        """Return the points of an archive, as `gather_points`, whose spheres are within `far` of centres [m]."""
+        data, residency, pose = seen.data, seen.data.residency, seen.placed.poses_in(self.pose[None])[0]
         arrays, tree = data.arrays, data.tree
-        more = self.reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
+        more = far + data.radius_units / UNITS_PER_METRE + 1e-6
         axes, shift = np.empty((6, 3)), pose[:3, 3] - arrays.origin
         axes[:3], axes[3:] = -pose[:3, :3], pose[:3, :3]
         heights = self._heights(axes)
@@ -109,14 +93,17 @@ class LeavingPose:
         box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
         nothing = np.empty((0, kernel.GATHERED))
         if data.nothing_clear or _meets(box, tree.unknown[:, 0], tree.unknown[:, 1]).any():
-            return _Gathered(nothing, True)
+            self.lacks = True
+            return nothing
         rows = np.flatnonzero(_meets(box, tree.low[: tree.voxels], tree.high[: tree.voxels])).tolist()
         held = data.references.to(arrays, tree)
         found, count = np.empty((4096, kernel.GATHERED)), 0
         for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
             with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
                 if loaded.late or loaded.faults:
-                    return _Gathered(nothing, True, len(loaded.late))
+                    budget.lacked(len(loaded.late))
+                    self.lacks, self.late = True, self.late or bool(loaded.late)
+                    return nothing
                 for row in part:
                     while True:
                         with residency.frozen():
@@ -127,7 +114,7 @@ class LeavingPose:
                             break
                         found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
                     count = now
-        return _Gathered(found[:count])
+        return found[:count]
 
     def _heights(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the greatest heights (k,) of the avatar's centres along directions (k, 3) of its frame [m]."""
@@ -173,12 +160,11 @@ class LeavingPose:
             if into > deepest:
                 deepest = into
                 nearest, core = plane[kernel.NEAREST : kernel.CORE], plane[kernel.CORE :]
-                hit = Hit(
-                    0.0, Verdict.CONTACT, self._in_world(core), self._in_world(nearest),
-                    normal=-rotate(self.pose, plane[: kernel.OFFSET]), end=self.pose,
-                )  # fmt: skip
                 at = int(np.flatnonzero((self._points == nearest).all(axis=1))[0])
-                hit = hit._replace(archive=int(self._archive[at]))
+                hit = Hit(
+                    0.0, Verdict.CONTACT, self._in_world(core), self._in_world(nearest), "", int(self._archive[at]),
+                    -rotate(self.pose, plane[: kernel.OFFSET]), end=self.pose,
+                )  # fmt: skip
         if hit is not None:
             return hit
         behind = [plane for plane in self._planes if dot(plane[: kernel.OFFSET], local) <= -_LEAVES * length]
@@ -249,6 +235,62 @@ def find_first_hit(
     return first_body_hit(frame, to, tolerance, until, below=below) or found
 
 
+def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, below: bool) -> Hit | None:
+    """Return the first hit of the motion from frame.pose to a pose with obstacles, before `until`.
+
+    until: fraction of the motion.  below: as for `find_first_hit`.
+    """
+    found = None
+    for obstacle in frame.obstacles:
+        hit = obstacle.sweep(frame.body.avatar, frame.pose, to, tolerance, below=below)
+        if hit is not None and hit.fraction < until:
+            found, until = hit, hit.fraction
+    return found
+
+
+def find_touched(frame: Frame, pose: Pose) -> Hit | None:
+    """Return a hit with fraction 0 if a pose touches something or is unknown, or None."""
+    avatar, lacked = frame.body.avatar, frame.lacked
+    verdict = frame.world.collide(avatar, pose, frame.budget)
+    if verdict == Verdict.CONTACT:
+        return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
+    if verdict == Verdict.UNKNOWN:
+        return Hit(0.0, verdict, None, None, unloaded=frame.lacked > lacked)
+    return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
+
+
+def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
+    """Return whether it is known that nothing is touched at a pose.
+
+    proved: whether this is already proved for the scene; then only obstacles are tested.
+    """
+    avatar = frame.body.avatar
+    if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
+        return False
+    return not touches_bodies(frame, pose)
+
+
+def touches_bodies(frame: Frame, pose: Pose) -> bool:
+    """Return whether an obstacle is touched at a pose."""
+    return any(each.touches(frame.body.avatar, pose) for each in frame.obstacles)
+
+
+def max_displacement(frame: Frame, to: Pose) -> float:
+    """Return an approximate bound of the distance that any avatar point moves to a pose [m].
+
+    The motion begins at frame.pose.
+    """
+    avatar, begin = frame.body.avatar, frame.pose
+    if not len(avatar.points):
+        return 0.0
+    way = to[:3, 3] - begin[:3, 3]
+    if is_translation(begin, to):
+        return norm(way)
+    turn = to[:3, :3] - begin[:3, :3]
+    center = way + rotate(turn, avatar.arrays.center[0])
+    return norm(center) + frobenius_norm(turn) * float(avatar.arrays.radius[0])
+
+
 def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:
     """Move to the pose the skin before a hit on the way to a pose (4, 4), or to a clear one before it.
 
@@ -269,3 +311,10 @@ def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:
             frame.pose = pose
             return
         back = max(_STEP_GROWTH * back, _FIRST_STEP_BACK / way)
+
+
+def record_hit(frame: Frame, hit: Hit) -> None:
+    """Record a hit where the frame begins."""
+    frame.hits.append(hit)
+    if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
+        frame.verdict = Verdict.UNKNOWN

@@ -142,7 +142,7 @@ def open_archives(
     """Place the archives of a scene, which the caller closes.
 
     name: of the scene.  found: by `find_archives`.  budget_bytes: limit of decoded voxels, all archives together.
-    policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
+    policy: eviction policy, see voxel_cache.py.  took: called with the duration of each voxel load
     [s].  level_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """

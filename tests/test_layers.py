@@ -319,7 +319,7 @@ def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("file", "source"),
     [
-        ("server/avatars/avatar_file.py", "from ...builder.sources.placed_scan import METRES"),
+        ("server/avatars/avatar_shape.py", "from ...builder.sources.placed_scan import METRES"),
         ("server/report/walk/demo_walk.py", "from ....builder.pipeline import build_archive"),
         ("server/cli/main.py", "from ...builder.passes.verify import verify_archive"),
         ("server/kernels/collide/collide_poses.py", "from ....schemas.runtime import compiling as nb"),

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.residency.eviction import EvictionPolicy, prefetches
-from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions
-from solidcloud.server.residency.prefetch import SILENCE
+from solidcloud.server.residency.prefetch import PREFETCH_OPTIONS, SILENCE, PrefetchOptions
+from solidcloud.server.residency.voxel_cache import EvictionPolicy, prefetches
 
 from .replay_requests import NOBODY, Requests, Town
 

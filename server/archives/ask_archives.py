@@ -21,9 +21,8 @@ from ..queries.path import path_question
 from ..queries.request import QueryBudget, ask_until_stopped, make_budget
 from ..queries.scene_data import SceneData, with_stop
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
-from .placed_archive import PlacedArchive
+from .placed_archive import ArchiveGeneration, PlacedArchive
 
 _A = TypeVar("_A", bound=Cost)
 # Items of a request in the frame of one archive, column by column, and whether the voxels near them

@@ -1,6 +1,6 @@
-"""Changes of what is resident of a scene, as they happen.
+"""What is resident of a scene: the answer of `stats`, and the changes as they happen.
 
-A log (residency/cache_stats.py) collects the changes of each archive under its cache's lock. A
+A log (`ChangeLog`) collects the changes of each archive under its cache's lock. A
 reader takes them at its own rate, so no load or eviction waits for a reader.
 """
 
@@ -11,6 +11,7 @@ from time import monotonic
 from typing import NamedTuple, Self
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
@@ -20,10 +21,60 @@ from ...schemas.wire.residency_messages import (
     SILENT_SECONDS,
     ResidencyChanges,
 )
-from ..residency.cache_stats import ChangeLog
-from ..residency.voxel_cache import VoxelCache
-from .archive_generation import ArchiveGeneration
-from .placed_archive import PlacedArchive
+from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
+from ..observability.request_stats import RequestStats, times_of
+from ..residency.voxel_cache import ChangeLog, VoxelCache
+from .placed_archive import ArchiveGeneration, PlacedArchive
+
+
+def make_stats(
+    name: str,
+    each: Sequence[ArchiveGeneration],
+    metrics: RequestStats,
+    avatars: AvatarStats,
+    *,
+    keys: bool = False,
+) -> StatsAnswer:
+    """Return cache statistics summed over the archives of a scene, and its request statistics.
+
+    metrics: the requests answered so far.  avatars: statistics of the clients' avatars.
+    keys: also list the resident voxels, each by its key in its own archive.
+    """
+    total, users = metrics.snapshot()
+    counts = total.counts
+    residencies = [opened.data.residency for opened in each]
+    level_bytes = sum(opened.level.residency.budget_bytes for opened in each if opened.level)
+    counters = [structs.asdict(residency.counters()) for residency in residencies]
+    loads = [seconds for residency in residencies for seconds in residency.load_times()]
+    return StatsAnswer(
+        scene=name,
+        generation=sum(opened.store.archive.header.generation for opened in each),
+        policy=residencies[0].policy.name,
+        budget_bytes=sum(residency.budget_bytes for residency in residencies) + level_bytes,
+        resident_bytes=sum(residency.resident_bytes for residency in residencies),
+        level_bytes=level_bytes,
+        voxels=sum(len(opened.store.sizes) for opened in each),
+        resident=sum(residency.resident for residency in residencies),
+        kept=sum(len(residency.kept) for residency in residencies),
+        requests=counts.requests,
+        answers=counts.answers,
+        unknown=counts.unknown,
+        waited=counts.waited,
+        load_seconds=times_of(loads, total.loads.times()),
+        stall_seconds=counts.stalls.times(),
+        engine_seconds=total.engine.times(),
+        users=users,
+        keys=sorted(key for opened in each for key in _resident_keys(opened)) if keys else None,
+        avatars=avatars,
+        **{field: sum(own[field] for own in counters) for field in Counters.__struct_fields__},
+    )
+
+
+def _resident_keys(opened: ArchiveGeneration) -> list[int]:
+    """Return the keys of an archive's resident voxels."""
+    rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
+    keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()
+    return keys
 
 
 class _Followed(NamedTuple):

@@ -13,7 +13,7 @@ from ....builder.synthetic.scenes import make_facade
 from ....builder.synthetic.walk import walk_poses
 from ....schemas.archive.archive import Archive
 from ....schemas.errors import BadRequestError
-from ...avatars.avatar_file import read_avatar
+from ...avatars.avatar_shape import read_avatar
 from ...cli.input.pose_file import read_poses
 
 PAPER_POINTS = 587_923

@@ -7,7 +7,7 @@ import pytest
 from small_builds import build
 from solidcloud.schemas.scene.scene_file import read_scene
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.avatars.avatar_file import read_avatar
+from solidcloud.server.avatars.avatar_shape import read_avatar
 from solidcloud.server.cli.main import run
 from solidcloud.server.scene import Scene
 

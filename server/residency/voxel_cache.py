@@ -213,7 +213,6 @@ class CacheStats:
             self.wasted_bytes += self._sizes[row]
 
     def _note(self, row: int, state: Residency) -> None:
-        """Note a change for all readers."""
         for log in self.logs:
             log.add(row, state)
 
@@ -304,7 +303,6 @@ class VoxelCache:
         self.on_owed: Callable[[], None] | None = None
         self.on_load_time: Callable[[float], None] | None = None
         self.misled = False
-        self.policy = policy or EvictionPolicy(budget_bytes)
         self._store = store
         self._sizes = [size if size <= budget_bytes else 0 for size in sizes]
         self._pins: dict[int, int] = {}  # row -> number of holds
@@ -316,9 +314,15 @@ class VoxelCache:
         }
         self._passing: set[int] = set()  # rows whose fault ends with the last hold
         self._owed: dict[int, None] = {}  # rows that requests did not get in time, in that order
-        self.stats = CacheStats(self._sizes)
+        self.policy = order = policy or EvictionPolicy(budget_bytes)
+        self.stats = counts = CacheStats(self._sizes)
+
+        def on_evict(row: int) -> None:  # no method: a reference to itself would keep the memory
+            counts.count_eviction(row)
+            order.removed(row)
+
         self._allocator = VoxelAllocator(
-            budget_bytes, self._sizes, self.policy.victims, self._note_evicted, self._pins, self._loading
+            budget_bytes, self._sizes, order.victims, on_evict, self._pins, self._loading
         )
         self.buffer, self.where = self._allocator.buffer, self._allocator.where
         self._lock = threading.RLock()
@@ -470,12 +474,10 @@ class VoxelCache:
         return seconds_to(deadline, stop) != 0
 
     def _pin(self, rows: Sequence[int]) -> None:
-        """Begin a hold on rows."""
         for row in rows:
             self._pins[row] = self._pins.get(row, 0) + 1
 
     def _unpin(self, rows: Sequence[int]) -> None:
-        """End a hold on rows."""
         for row in rows:
             self._pins[row] -= 1
             if not self._pins[row]:
@@ -491,7 +493,6 @@ class VoxelCache:
         return row in self._allocator.offsets
 
     def _absent(self, rows: Iterable[int]) -> list[int]:
-        """Return the rows that are absent."""
         return [row for row in rows if not self.is_resident(row) and row not in self._faults]
 
     def _sort_out(self, rows: Sequence[int]) -> tuple[list[int], tuple[str, ...], tuple[int, ...]]:
@@ -538,11 +539,6 @@ class VoxelCache:
     def _forget(self, row: int) -> None:
         """Release the bytes of a voxel that was not loaded."""
         self._allocator.forget(row)
-        self.policy.removed(row)
-
-    def _note_evicted(self, row: int) -> None:
-        """Record that a voxel is evicted. The allocator calls this."""
-        self.stats.count_eviction(row)
         self.policy.removed(row)
 
     # --- loads ---

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
+from collections.abc import Collection, Iterator, Sequence, Sized
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -53,13 +53,14 @@ from .runtime.path_threads import PathThreads
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .scene_archives import (
+    FoundAvatar,
     error_location,
     find_archives,
     is_scene_file,
     open_archives,
     read_avatars,
 )
-from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, QueryMethods, list_avatars
+from .scene_interface import AvatarLimits, AvatarShape, QueryMethods, list_avatars
 from .simulation.local_session import LocalSession
 from .simulation.simulation import Simulation, make_simulation
 from .tiles.scene_overview import read_overview
@@ -84,14 +85,14 @@ class Scene(QueryMethods):
         name: str,
         metrics: RequestStats | None = None,
         file: SceneFile | None = None,
-        avatars: Mapping[str, AvatarShape] | None = None,
+        avatars: Sequence[FoundAvatar] = (),
     ) -> None:
         """Serve archives, which this scene closes with itself; callers use `Scene.open`.
 
         metrics: statistics of answers, and of the loads of these archives; None: new ones.
         file: declares effects, objects and limits; None: the effect `stop` alone.
-        avatars: avatars that every client may use, by name.
-        Raise BadRequestError if there is no archive, or an avatar is invalid.
+        avatars: avatars that every client may use.
+        Raise BadRequestError if there is no archive.
         """
         if not archives:
             raise BadRequestError(f"{name}: a scene without archives: expected at least one")
@@ -103,9 +104,9 @@ class Scene(QueryMethods):
         self._file = scene_of(name) if file is None else file
         self._simulation: Simulation | None = None
         self._making = threading.Lock()
-        self._own = [
-            self.add_avatar(each, shape, client=EVERYBODY) for each, shape in (avatars or {}).items()
-        ]
+        self._own = [each.info for each in avatars]
+        for each in avatars:
+            self._avatars.provide(each.info.name, each.model)
 
     @classmethod
     def open(
@@ -152,7 +153,7 @@ class Scene(QueryMethods):
         name = name or scene_name(file, path)
         with ExitStack() as stack:
             found = find_archives(file, path, stack)
-            avatars = {each.info.name: each.shape for each in read_avatars(file, path)}
+            avatars = read_avatars(file, path)
             archives = open_archives(
                 file, path, name, found, budget_bytes, policy, metrics.loaded, level_bytes
             )

@@ -21,12 +21,11 @@ from ..schemas.scene.scene_file import SUFFIX, SceneFile
 from ..schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import describe
-from .avatars.avatar_model import describe_avatar, make_avatar
+from .avatars.avatar_model import AvatarModel, describe_avatar, make_avatar
 from .avatars.avatar_shape import avatar_shape
 from .kernels.core.placed_avatar import MAX_REACH_UNITS
 from .residency.arena import ArenaBuffer
 from .residency.voxel_store import OpenStore, VoxelStore
-from .scene_interface import AvatarShape
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/world/bodies.py).
@@ -41,10 +40,10 @@ class FoundArchive(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """Avatar that a scene file names. shape: of its file, with its final radius."""
+    """Avatar that a scene file names."""
 
     file: Path
-    shape: AvatarShape
+    model: AvatarModel
     info: AvatarInfo
 
 
@@ -90,8 +89,7 @@ def read_avatars(file: SceneFile, path: Path) -> list[FoundAvatar]:
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
                     "`objects` or `crowd`, under which avatars collide with others"
                 )
-        shape = shape._replace(points=model.points, radius=model.radius)
-        found.append(FoundAvatar(avatar_file, shape, describe_avatar(item.name, model, shape.description)))
+        found.append(FoundAvatar(avatar_file, model, describe_avatar(item.name, model, shape.description)))
     return found
 
 

@@ -60,7 +60,7 @@ ALLOWED = {
     "server/simulation": (
         "runtime scene_interface.py avatars queries archives simulation/world simulation/effects"
     ),
-    "server/scene_archives.py": "kernels scene_interface.py avatars residency archives simulation/effects",
+    "server/scene_archives.py": "kernels avatars residency archives simulation/effects",
     "server/pictures": "avatars archives",
     "server/scene.py": (
         "observability runtime scene_interface.py avatars residency queries archives simulation scene_archives.py "

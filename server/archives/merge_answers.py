@@ -168,7 +168,11 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     """
     clusters, cluster_poses, cluster_starts = _listed(answers, "cluster_starts", _CLUSTERS)
     # Clusters of several archives may contain the same deepest pair.
-    keys = (*_by_axis(clusters["cluster_high"]), *_by_axis(clusters["cluster_low"]), clusters["cluster_count"])
+    keys = (
+        *_by_axis(clusters["cluster_high"]),
+        *_by_axis(clusters["cluster_low"]),
+        clusters["cluster_count"],
+    )
     keys += (*_by_axis(clusters["cluster_avatar"]), *_by_axis(clusters["cluster_cloud"]))
     order = np.lexsort((*keys, clusters["cluster_deepest"], cluster_poses))
     fields = {name: column[order] for name, column in clusters.items()}

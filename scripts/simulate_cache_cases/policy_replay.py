@@ -295,9 +295,8 @@ class Replay:
         """Update the prefetch queue and the users' positions."""
         self.planned = now
         self.tracks.expire(now, SILENCE)
-        wanted = self.tracks.plan(now, self.usual)
+        self.need = self.tracks.plan(now, self.usual)
         self.kept = frozenset(self.tracks.kept().tolist())
-        self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
         resident = self.resident
         self.queue.clear()
         self.queue.extend(each for each in self.need.items() if each[0] not in resident)

@@ -8,6 +8,7 @@ or merged.
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,18 +53,11 @@ def hold_archives(
     radius_model: see schemas/archive/radius_model.py; None: that of each archive. Raise BadRequestError.
     """
     held: list[HeldArchive] = []
-    try:
+    with ExitStack() as stack:
         for placed in archives:
-            opened = placed.take()
-            try:
-                data = with_stop(opened.radius_model(radius_model), stop)
-            except BaseException:
-                opened.release()
-                raise
-            held.append(HeldArchive(placed, opened, data))
-    except BaseException:
-        release(held)
-        raise
+            opened = stack.enter_context(placed.take())
+            held.append(HeldArchive(placed, opened, with_stop(opened.radius_model(radius_model), stop)))
+        stack.pop_all()
     return held
 
 

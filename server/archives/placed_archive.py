@@ -31,7 +31,7 @@ from ..queries.engine_table import warm_engines
 from ..queries.level_of_detail import open_level_data, with_level
 from ..queries.raycast import make_directions
 from ..queries.scene_data import SceneData, make_scene_data, make_tree, with_radius_model
-from ..residency.level_store import level_filler, open_level_store
+from ..residency.level_store import fill_level, open_level_store
 from ..residency.prefetch import Prefetcher, User, UserTracks
 from ..residency.voxel_cache import EvictionPolicy, VoxelCache, prefetches
 from ..residency.voxel_store import OpenStore, VoxelStore
@@ -91,67 +91,52 @@ class ArchiveGeneration:
         radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
         that the archive does not store, FormatError for a level of detail, whose points are not all.
         """
-        if store.archive.header.is_level:
+        archive = store.archive
+        if archive.header.is_level:
             raise FormatError(
-                f"{store.archive.folder}: a level of detail, expected an archive: give the folder of its archive, or "
+                f"{archive.folder}: a level of detail, expected an archive: give the folder of its archive, or "
                 "restore it"
             )
         self.store, self.number = store, number
-        self.sources = store.archive.header.listed_sources
+        self.sources = archive.header.listed_sources
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
         self._lock = threading.Lock()
         self._readers = 1
         self._ending: threading.Thread | None = None
-        self.level = open_level_store(store, budget_bytes, level_bytes)
+        self.level = level = open_level_store(store, budget_bytes, level_bytes)
         try:
-            self._assemble(budget_bytes, policy, took, radius_model, level_given=level_bytes is not None)
+            budget_bytes -= level.residency.budget_bytes if level else 0
+            residency = VoxelCache(
+                store,
+                budget_bytes,
+                EvictionPolicy(budget_bytes, policy),
+                # What was given to the level may leave too little for a voxel.
+                refuse_large=level is None or level_bytes is None,
+            )
+            residency.on_load_time = took
+            ahead, lattice, tree = prefetches(policy), archive.header.lattice, make_tree(archive)
+            self.prefetcher = Prefetcher(
+                residency,
+                UserTracks(tree, lattice.origin, lattice.step),
+                prefetch=ahead,
+                idle=fill_level(level) if level and level.fits else None,
+                level=level and level.residency,
+            )
+            single = make_scene_data(archive, residency, tree)
+            of_level = level and open_level_data(
+                level.store.archive, level.residency, archive, settles_exact=ahead or level_bytes is not None
+            )
+
+            @lru_cache(_MAX_MODELS)
+            def with_model(text: str | None) -> SceneData:
+                chosen = radius_model if text is None else text
+                return with_level(with_radius_model(single, archive, chosen), of_level)
+
+            self.radius_model, self.data = with_model, with_model(None)
         except BaseException:
             self._close_level()
             raise
-
-    def _assemble(
-        self,
-        budget_bytes: int,
-        policy: str,
-        took: Callable[[float], None] | None,
-        radius_model: str | None,
-        *,
-        level_given: bool,
-    ) -> None:
-        """Make caches, prefetcher and scene data. level_given: whether memory was given to the level.
-
-        The other parameters are as in `__init__`.
-        """
-        archive, level = self.store.archive, self.level
-        budget_bytes -= level.residency.budget_bytes if level else 0
-        residency = VoxelCache(
-            self.store,
-            budget_bytes,
-            EvictionPolicy(budget_bytes, policy),
-            # What was given to the level may leave too little for a voxel.
-            refuse_large=level is None or not level_given,
-        )
-        residency.on_load_time = took
-        ahead, lattice, tree = prefetches(policy), archive.header.lattice, make_tree(archive)
-        self.prefetcher = Prefetcher(
-            residency,
-            UserTracks(tree, lattice.origin, lattice.step),
-            prefetch=ahead,
-            idle=level_filler(level),
-            level=level and level.residency,
-        )
-        single = make_scene_data(archive, residency, tree)
-        of_level = level and open_level_data(
-            level.store.archive, level.residency, archive, settles_exact=ahead or level_given
-        )
-
-        @lru_cache(_MAX_MODELS)
-        def with_model(text: str | None) -> SceneData:
-            chosen = radius_model if text is None else text
-            return with_level(with_radius_model(single, archive, chosen), of_level)
-
-        self.radius_model, self.data = with_model, with_model(None)
 
     def take(self) -> bool:
         """Add a reader, which must `release`. Return False if the last reader has already left."""

@@ -5,10 +5,9 @@ reader takes them at its own rate, so no load or eviction waits for a reader.
 """
 
 import threading
-import weakref
 from collections.abc import Iterator, Sequence
 from time import monotonic
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from msgspec import structs
@@ -23,7 +22,7 @@ from ...schemas.wire.residency_messages import (
 )
 from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
 from ..observability.request_stats import RequestStats, times_of
-from ..residency.voxel_cache import ChangeLog, VoxelCache
+from ..residency.voxel_cache import ChangeLog
 from .placed_archive import ArchiveGeneration, PlacedArchive
 
 
@@ -77,14 +76,6 @@ def _resident_keys(opened: ArchiveGeneration) -> list[int]:
     return keys
 
 
-class _Followed(NamedTuple):
-    """Generation of an archive that is followed. It must not be kept in memory by this."""
-
-    number: int
-    cache: "weakref.ref[VoxelCache]"
-    log: ChangeLog
-
-
 class ResidencyWatch:
     """Changes of a scene since this was made; a context manager, thread-safe.
 
@@ -94,13 +85,15 @@ class ResidencyWatch:
     def __init__(self, archives: Sequence[PlacedArchive]) -> None:
         """Begin to follow archives. Raise BadRequestError if the scene is closed."""
         self._archives = archives
-        self._followed: list[_Followed | None] = [None] * len(archives)
+        # For each archive, the number of the generation that is followed, which this does not keep in
+        # memory, and the log of its cache.
+        self._followed: list[tuple[int, ChangeLog] | None] = [None] * len(archives)
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._seq, self._said = 0, 0.0
         for number, archive in enumerate(archives):
             with archive.take() as opened:
-                self._follow(number, opened)
+                self._followed[number] = opened.number, opened.data.residency.follow()
         self._lost = True  # the first message is the beginning
 
     def __enter__(self) -> Self:
@@ -115,8 +108,7 @@ class ResidencyWatch:
         """End following; `changes` ends. Closing twice is allowed."""
         self._closed.set()
         with self._lock:
-            for number in range(len(self._followed)):
-                self._unfollow(number)
+            self._followed = [None] * len(self._archives)
 
     def __iter__(self) -> Iterator[ResidencyChanges]:
         """Yield the messages of `changes`."""
@@ -149,9 +141,10 @@ class ResidencyWatch:
             for number, archive in enumerate(self._archives):
                 with archive.take() as opened:
                     followed, cache = self._followed[number], opened.data.residency
-                    if followed is None or followed.number != opened.number:
-                        followed, lost = self._follow(number, opened), True
-                    changes, overflowed = cache.take_changes(followed.log)
+                    if followed is None or followed[0] != opened.number:
+                        followed, lost = (opened.number, cache.follow()), True
+                        self._followed[number] = followed
+                    changes, overflowed = cache.take_changes(followed[1])
                     lost |= overflowed
                     resident += cache.resident
                     resident_bytes += cache.resident_bytes
@@ -176,17 +169,3 @@ class ResidencyWatch:
                 resident,
                 resident_bytes,
             )
-
-    def _follow(self, number: int, opened: ArchiveGeneration) -> _Followed:
-        """Follow a generation of an archive, in place of an earlier one."""
-        self._unfollow(number)
-        cache = opened.data.residency
-        followed = _Followed(opened.number, weakref.ref(cache), cache.follow())
-        self._followed[number] = followed
-        return followed
-
-    def _unfollow(self, number: int) -> None:
-        """End following a generation."""
-        followed, self._followed[number] = self._followed[number], None
-        if followed is not None and (cache := followed.cache()) is not None:
-            cache.unfollow(followed.log)

@@ -65,7 +65,7 @@ def avatar_shape(
         return source._replace(points=_scaled(source.points, scale), radius=radius)
     radius = None if radius is None else float(radius) * scale
     if isinstance(source, str | os.PathLike):
-        read = read_avatar_file(Path(source), up, units, faces=True)
+        read = read_avatar(Path(source), up, units, faces=True)
         if len(read.triangles):
             return _mesh_shape(read.triangles * scale, radius, str(source), hollow, read.axes)
         return AvatarShape(read.points * scale, radius, 0, f"points: {_SURFACE}; {read.axes}")
@@ -131,15 +131,7 @@ class ReadAvatar(NamedTuple):
     axes: str
 
 
-def read_avatar(path: Path) -> NDArray[np.float64]:
-    """Read the points (n, 3) of an avatar from a scan, or the vertices from a mesh, float64 [m].
-
-    Raise the errors of `read_avatar_file`.
-    """
-    return read_avatar_file(path).points
-
-
-def read_avatar_file(
+def read_avatar(
     path: Path, up: str | None = None, units: str | None = None, *, faces: bool = False
 ) -> ReadAvatar:
     """Read the points of a scan, or the vertices of a mesh.

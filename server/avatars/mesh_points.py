@@ -136,10 +136,8 @@ def _area(triangles: _Floats) -> float:
 
 def _distinct(points: _Floats) -> _Floats:
     """Return the distinct points (n, 3), sorted by x, then y, then z."""
-    points = points[np.lexsort((points + 0.0).T[::-1])] + 0.0
-    new = np.ones(len(points), bool)
-    new[1:] = (points[1:] != points[:-1]).any(axis=1)
-    return np.ascontiguousarray(points[new])
+    _, first = np.unique(_numbered(points), return_index=True)
+    return np.asarray(points[first] + 0.0)  # no -0.0
 
 
 def _surface_too_large(what: str, area: float, radius: float) -> TooLargeError:

@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -106,19 +106,6 @@ class PrefetchOptions(NamedTuple):
 
 
 PREFETCH_OPTIONS = PrefetchOptions()
-
-
-class PredictedVoxels(NamedTuple):
-    """Voxels that users will need.
-
-    rows: (n,) int64, each once, soonest first.
-    need: (n,) float64, seconds from now until the avatar could touch the voxel; 0: it does now.
-    Rows of the ring that the predicted path does not touch have a need beyond the horizon, nearest
-    first.
-    """
-
-    rows: Integers
-    need: Floats
 
 
 class _Track:
@@ -227,10 +214,11 @@ class UserTracks:
             rows = [(*t.center, *t.velocity, t.reach, t.last, t.since) for t in self._users.values()]
         return np.array(rows).reshape(-1, 9)
 
-    def plan(self, now: float, load_seconds: float) -> PredictedVoxels:
-        """Predict the voxels that users will need.
+    def plan(self, now: float, load_seconds: float) -> dict[int, float]:
+        """Predict the voxels that users will need: row -> seconds from now, soonest first.
 
-        Each row is listed once, with the earliest need of all users.
+        The seconds are until an avatar could touch the voxel, the earliest of all users; 0: one does
+        now. Rows of the ring that the predicted path does not touch have more than the horizon.
         load_seconds: current time to load one voxel including queueing, an upper percentile of the
         measured times.
         """
@@ -259,7 +247,7 @@ class UserTracks:
         rows, need = lists.rows[:n][first_few], need[first_few]
         order = np.argsort(need, kind="stable")
         order = order[np.sort(np.unique(rows[order], return_index=True)[1])]
-        return PredictedVoxels(rows[order], need[order])
+        return dict(zip(rows[order].tolist(), need[order].tolist(), strict=True))
 
     def kept(self) -> Integers:
         """Return the rows (n,), ascending, that users can touch at their last positions."""
@@ -297,15 +285,15 @@ class Prefetcher:
         tracks: UserTracks,
         *,
         prefetch: bool = True,
-        idle: Callable[[], bool] | None = None,
+        idle: Iterator[object] | None = None,
         clock: Callable[[], float] = time.perf_counter,
         level: VoxelCache | None = None,
     ) -> None:
         """Make a prefetcher without a thread.
 
         prefetch: whether to prefetch; if False, load only owed voxels and keep users' voxels.
-        idle: called repeatedly when there is nothing to load, until it returns False; each call
-        does some milliseconds of work.
+        idle: advanced when there is nothing to load, until its end; each step does some
+        milliseconds of work.
         clock: returns the time [s].
         level: cache of the level of detail, whose owed loads are done before those of `residency`.
         """
@@ -421,25 +409,23 @@ class Prefetcher:
             times = sorted(residency.load_times())
             usual = times[int(LOAD_TIME_QUANTILE * (len(times) - 1))] if times else 0.0
             tracks.expire(now, SILENCE)
-            wanted = tracks.plan(now, usual)
-            need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+            need = tracks.plan(now, usual)
             residency.kept = self._within_share(tracks.kept().tolist(), need)
         except Exception:  # for example out of memory: requested voxels are loaded all the same
             log.exception("the prefetch plan failed")
             return {}, now + MAX_REST
         return need, now + min(max(PLAN_SECONDS, PLAN_REST * (time.thread_time() - begin)), MAX_REST)
 
-    def _use_idle_time(self, idle: Callable[[], bool]) -> float:
+    def _use_idle_time(self, idle: Iterator[object]) -> float:
         """Do one piece of idle work; return how long to pause afterwards [s]."""
         self._residency.wait_until_idle()
         begin = time.thread_time()
         try:
-            left = idle()
-        except Exception:
-            log.exception("idle work failed and is abandoned")
-            left = False
-        if not left:
+            next(idle)
+        except Exception as error:
             self._idle = None
+            if not isinstance(error, StopIteration):
+                log.exception("idle work failed and is abandoned")
         return IDLE_REST * (time.thread_time() - begin)
 
     def _step(self, queue: deque[tuple[int, float]], need: dict[int, float]) -> bool:

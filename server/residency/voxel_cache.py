@@ -27,6 +27,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 
@@ -130,7 +131,7 @@ class EvictionPolicy:
                 yield row
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, weakref_slot=True, eq=False)
 class ChangeLog:
     """Latest change of each voxel since a reader last took them, bounded in size.
 
@@ -162,7 +163,7 @@ class CacheStats:
         self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
         self.fresh: set[int] = set()
         self.times: deque[float] = deque(maxlen=MAX_LOAD_TIMES)
-        self.logs: tuple[ChangeLog, ...] = ()
+        self.logs: WeakSet[ChangeLog] = WeakSet()
         self._evicted_at: dict[int, float] = {}  # row -> time of its last eviction, in order of time
 
     def count_used(self, rows: Sequence[int]) -> None:
@@ -664,16 +665,11 @@ class VoxelCache:
             return list(self.stats.times)
 
     def follow(self) -> ChangeLog:
-        """Return a log of all changes from now on, until `unfollow`."""
+        """Return a log of all changes from now on, as long as a reader refers to it."""
         log = ChangeLog()
         with self._lock:
-            self.stats.logs += (log,)
+            self.stats.logs.add(log)
         return log
-
-    def unfollow(self, log: ChangeLog) -> None:
-        """End a log."""
-        with self._lock:
-            self.stats.logs = tuple(other for other in self.stats.logs if other is not log)
 
     def take_changes(self, log: ChangeLog) -> tuple[dict[int, Residency], bool]:
         """Return the changes in a log, by index row, and whether some are missing; begin it anew."""

@@ -136,7 +136,7 @@ def query(
         return _ask_moves(connect, scene, question, avatars, as_json, key_file)
     found, asked, printed = [], 0, 0
     with Client(connect, scene=scene, key_file=key_file) as client:
-        for part in ask(client, question, read_avatar, avatars.read):
+        for part in ask(client, question, lambda points: read_avatar(points).points, avatars.read):
             found.append(part)
             asked += len(part.labels)
             if as_json or client.unanswered == asked:

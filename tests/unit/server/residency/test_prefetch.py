@@ -5,6 +5,7 @@ What users will need: straight on, turning, stopping, with jitter, after a telep
 
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from solidcloud.server.kernels.core.reach import VoxelTree, make_voxel_tree
 from solidcloud.server.residency.prefetch import (
     PREFETCH_OPTIONS,
     STALE,
-    PredictedVoxels,
     Prefetcher,
     User,
     UserTracks,
@@ -47,12 +47,10 @@ class Wishes:
     def expire(self, now: float, after: float) -> None:
         """Nobody is."""
 
-    def plan(self, now: float, load_seconds: float) -> PredictedVoxels:
+    def plan(self, now: float, load_seconds: float) -> dict[int, float]:
         """What is wanted, soonest first."""
         self.plans += 1
-        rows = sorted(self.wanted, key=lambda row: self.wanted[row])
-        need = np.array([self.wanted[row] for row in rows])
-        return PredictedVoxels(np.array(rows, np.int64), need)
+        return dict(sorted(self.wanted.items(), key=lambda item: item[1]))
 
     def kept(self) -> np.ndarray:
         """What users stand in."""
@@ -181,9 +179,8 @@ def test_a_client_that_goes_keeps_nothing() -> None:
 
 
 def test_who_comes_from_nowhere_is_told_so_and_idle_time_is_used() -> None:
-    left = iter([True, True, False])
-    calls: list[bool] = []
-    table = Table([1] * 3, 3, idle=lambda: calls.append(True) or next(left))
+    calls: list[int] = []
+    table = Table([1] * 3, 3, idle=(calls.append(step) for step in range(3)))
     with table.prefetcher:
         assert table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1e3)
         assert not table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1.0)
@@ -229,6 +226,19 @@ HIGH = LOW + VOXEL_STEPS - 1
 TREE = tree_of(LOW, HIGH)
 
 
+class Wanted(NamedTuple):
+    """The voxels of a plan, rows (n,), and the seconds until each, need (n,)."""
+
+    rows: NDArray[np.int64]
+    need: NDArray[np.float64]
+
+
+def plan(around: UserTracks, now: float, load_seconds: float) -> Wanted:
+    """What is wanted, soonest first."""
+    found = around.plan(now, load_seconds)
+    return Wanted(np.array(list(found), np.int64), np.array(list(found.values())))
+
+
 def make(ahead: object = PREFETCH_OPTIONS) -> UserTracks:
     """Nobody there yet."""
     return UserTracks(TREE, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
@@ -268,7 +278,7 @@ def straight(speed: float, poses: int = 30) -> NDArray[np.float64]:
 def test_straight_on_the_next_voxels_come_in_their_order_and_time() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    wanted = around.plan(now, 0.25)
+    wanted = plan(around, now, 0.25)
     x = straight(3.0)[-1, 0]  # 3.9 m; the reach ends 0.5 m ahead, voxels at 2, 4, 6, ...
     assert NO_RING.horizon(0.25) == 2.0
     assert [cell for cell in cells(wanted.rows) if cell[1] != 0] == []
@@ -282,7 +292,7 @@ def test_straight_on_the_next_voxels_come_in_their_order_and_time() -> None:
 def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     around = make()
     now = walk(around, np.tile([1.9, 1.0], (70, 1)))
-    wanted = around.plan(now, 0.25)
+    wanted = plan(around, now, 0.25)
     assert cells(wanted.rows) == touched(1.9, 1.0, REACH + PREFETCH_OPTIONS.ring)
     here = touched(1.9, 1.0, REACH)
     assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
@@ -291,15 +301,15 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / PREFETCH_OPTIONS.ring
     expected = PREFETCH_OPTIONS.horizon(0.25) * (1 + beyond[len(here) :])
     for later in (0.0, STALE + 0.1):  # not heard of for a while: the same
-        need = around.plan(now + later, 0.25).need
+        need = plan(around, now + later, 0.25).need
         assert np.allclose(need[len(here) :], expected, rtol=0.02) and (np.diff(need) >= 0).all()
     assert len(expected) > 1
 
 
-def make_plan(ahead: object, places: NDArray[np.float64]) -> PredictedVoxels:
+def make_plan(ahead: object, places: NDArray[np.float64]) -> Wanted:
     """What a user who went along places wants."""
     around = make(ahead)
-    return around.plan(walk(around, places), 0.25)
+    return plan(around, walk(around, places), 0.25)
 
 
 def test_who_turns_wants_what_is_ahead_of_it_now() -> None:
@@ -338,7 +348,7 @@ def test_jitter_changes_little(seed: int) -> None:
     times = np.maximum.accumulate(np.arange(60) / 30 + rng.uniform(0, 0.01, 60))
     for now, (x, y) in zip(times.tolist(), places.tolist(), strict=True):
         assert not around.record_pose(ME, now, at(x, y), REACH)
-    wanted = around.plan(float(times[-1]), 0.25)
+    wanted = plan(around, float(times[-1]), 0.25)
     soon = wanted.rows[wanted.need <= 2.0]
     end = straight(1.5, 60)[-1, 0]
     for ahead in np.linspace(0.0, 1.0, 20):
@@ -349,7 +359,7 @@ def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
     around = make(NO_RING)
     now = walk(around, straight(5.0))
     assert around.record_pose(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
-    wanted = around.plan(now + 1 / 30, 0.5)
+    wanted = plan(around, now + 1 / 30, 0.5)
     assert cells(wanted.rows) == touched(-30.0, -30.0, REACH) and (wanted.need == 0).all()
     assert cells(around.kept()) == touched(-30.0, -30.0, REACH)
     assert not around.record_pose(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
@@ -358,9 +368,9 @@ def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
 def test_poses_out_of_order_are_passed_over() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    before = around.plan(now, 0.25)
+    before = plan(around, now, 0.25)
     assert not around.record_pose(ME, now - 0.01, at(-20, -20), REACH)
-    after = around.plan(now, 0.25)
+    after = plan(around, now, 0.25)
     assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
 
 
@@ -378,11 +388,11 @@ def test_who_leaves_is_forgotten() -> None:
         walk(around, straight(1.0), user=user)
     assert around.users == [ME, YOU, other]
     around.leave_client("client")
-    assert around.users == [other] and len(around.plan(1.0, 0.1).rows)
+    assert around.users == [other] and len(plan(around, 1.0, 0.1).rows)
     around.expire(29 / 30 + 10.0, 10.0)
     assert around.users == [other]
     around.expire(11.0, 10.0)
-    assert around.users == [] and len(around.plan(11.0, 0.1).rows) == 0 and around.kept().tolist() == []
+    assert around.users == [] and len(plan(around, 11.0, 0.1).rows) == 0 and around.kept().tolist() == []
 
 
 # --- against brute force over all voxels at many moments of the way ---------------------------
@@ -408,7 +418,7 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
                 at = place + speed * number / 30
                 around.record_pose(("c", str(user)), number / 30, tuple(at.tolist()), reach)
         now, horizon = 19 / 30, ahead.horizon(0.25)
-        wanted = around.plan(now, 0.25)
+        wanted = plan(around, now, 0.25)
         assert len(set(wanted.rows.tolist())) == len(wanted.rows) and (np.diff(wanted.need) >= 0).all()
         wide = reach / STEP + 1.0
         for track in around._users.values():

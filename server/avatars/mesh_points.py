@@ -302,15 +302,15 @@ def _nodes_inside(found: ClosedParts, lattice: _Lattice) -> _Integers | None:
     order = np.lexsort((height, column, part))
     column, part, height, way = column[order], part[order], height[order], way[order]
     # The crossings of a column and a part cancel out, so that the sum begins with 0 in each.
-    within = np.flatnonzero(np.cumsum(way)[:-1] != 0) if len(way) else np.empty(0, np.int64)
+    within = np.flatnonzero(np.cumsum(way)[:-1] != 0)
     odd = column // lattice.counts[1] & 1
     # A node belongs to the interval that begins below it and ends at or above it.
     above = np.floor((height - odd) / 2).astype(np.int64)
     lengths = above[within + 1] - above[within]
     if lengths.sum() > 4 * MAX_AVATAR_POINTS:
         return None
-    which, at = _expand(lengths)
-    row = within[which]
+    row = np.repeat(within, lengths)
+    at = np.arange(len(row)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     k = 2 * (above[row] + 1 + at) + odd[row]
     numbers, parts = column[row] * lattice.counts[2] + k, part[row]
     holes = found.hole[parts]
@@ -333,13 +333,9 @@ def _crossings(
     low, high = found.corners[:, :, :2].min(axis=1), found.corners[:, :, :2].max(axis=1)
     origin = lattice.first[:2] + odd * lattice.half
     period = 2 * lattice.half
-    begin, count = -((origin - low) // period), 0
-    count = np.maximum((high - origin) // period - begin + 1, 0)
+    begin, end = -((origin - low) // period), (high - origin) // period
     parts: list[tuple[_Integers, ...]] = []
-    for rows in _slices(count.prod(axis=1)):
-        which, at = _expand(count[rows].prod(axis=1))
-        which += rows.start
-        column = begin[which] + np.stack(np.divmod(at, count[which, 1]), axis=1)
+    for which, column in _nodes_of(begin, end):
         place = origin + column * period
         corner = found.corners[which]
         left, areas = [], []
@@ -365,8 +361,6 @@ def _crossings(
                 np.where(left[0][met], 1, -1),
             )
         )
-    if not parts:
-        return (np.empty(0, np.int64),) * 2 + (np.empty(0), np.empty(0, np.int64))
     return tuple(np.concatenate(each) for each in zip(*parts, strict=True))  # type: ignore[return-value]
 
 
@@ -382,12 +376,7 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
     found: list[tuple[NDArray[np.generic], ...]] = []
     for odd in (0, 1):
         begin = np.ceil((low - odd) / 2).astype(np.int64)
-        count = np.maximum(np.floor((high - odd) / 2).astype(np.int64) - begin + 1, 0)
-        for rows in _slices(count.prod(axis=1)):
-            which, at = _expand(count[rows].prod(axis=1))
-            which += rows.start
-            rest, k = np.divmod(at, count[which, 2])
-            index = begin[which] + np.stack([*np.divmod(rest, count[which, 1]), k], axis=1)
+        for which, index in _nodes_of(begin, np.floor((high - odd) / 2).astype(np.int64)):
             number = lattice.numbers(*(2 * index + odd).T)
             at_or_after = np.minimum(np.searchsorted(inside, number), max(len(inside) - 1, 0))
             outside = inside[at_or_after] != number if len(inside) else np.ones(len(number), bool)
@@ -396,12 +385,10 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
             square = ((foot - lattice.places(number)) ** 2).sum(axis=1)
             near = square <= reach * reach
             found.append((number[near], which[near], foot[near], square[near]))
-    if not found:
-        return np.empty((0, 3))
     number, which, foot, square = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.lexsort((*foot.T, square, number))
     number, which, foot, square = number[order], which[order], foot[order], square[order]
-    chosen = []
+    chosen = [np.empty((0, 3))]
     while len(number):
         begins = np.r_[True, number[1:] != number[:-1]]
         chosen.append(foot[begins])
@@ -412,7 +399,7 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
         covered = (height <= apart) & (2 * height <= radius * radius - reach * reach + apart)
         covered |= begins
         number, which, foot, square = (each[~covered] for each in (number, which, foot, square))
-    return np.concatenate(chosen) if chosen else np.empty((0, 3))
+    return np.concatenate(chosen)
 
 
 def _nearest_on(triangles: _Floats, places: _Floats) -> _Floats:
@@ -479,21 +466,25 @@ def _volumes(corners: _Integers) -> _Floats:
     return found
 
 
-def _expand(counts: _Integers) -> tuple[_Integers, _Integers]:
-    """Return for each of counts.sum() items the row it belongs to, and its number in that row."""
-    rows = np.repeat(np.arange(len(counts)), counts)
-    return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+def _nodes_of(begin: _Integers, end: _Integers) -> Iterator[tuple[_Integers, _Integers]]:
+    """Yield rows (m,) and integers (m, d) from begin to end, inclusive, of each row (n, d).
 
-
-def _slices(counts: _Integers) -> Iterator[slice]:
-    """Divide rows into slices of about _PAIRS items. counts: of the items in each row."""
+    About _PAIRS at a time.
+    """
+    sides = np.maximum(end - begin + 1, 0)
+    counts = sides.prod(axis=1)
     ends = np.cumsum(counts)
-    begin = 0
-    while begin < len(counts):
-        done = ends[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(ends, done + _PAIRS, side="right")))
-        yield slice(begin, end)
-        begin = end
+    first = 0
+    while first < len(counts):
+        before = ends[first] - counts[first]
+        last = max(first + 1, int(np.searchsorted(ends, before + _PAIRS, side="right")))
+        rows = np.repeat(np.arange(first, last), counts[first:last])
+        at = np.arange(before, ends[last - 1]) - (ends - counts)[rows]
+        index = np.empty((len(rows), sides.shape[1]), np.int64)
+        for axis in reversed(range(sides.shape[1])):
+            at, index[:, axis] = np.divmod(at, sides[rows, axis])
+        yield rows, begin[rows] + index
+        first = last
 
 
 def _inside_too_large(what: str, radius: float) -> TooLargeError:

@@ -25,7 +25,6 @@ from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..schemas.wire.warming_parts import MOTION, PARTS
-from .archives.archive_generation import ArchiveGeneration
 from .archives.ask_archives import (
     PathParts,
     PlacedItems,
@@ -36,9 +35,9 @@ from .archives.ask_archives import (
     release,
 )
 from .archives.merge_answers import limit_pairs
-from .archives.placed_archive import PlacedArchive
-from .archives.residency_watch import ResidencyWatch
-from .archives.scene_info import describe_scene, join_infos, make_stats
+from .archives.placed_archive import ArchiveGeneration, PlacedArchive
+from .archives.residency_watch import ResidencyWatch, make_stats
+from .archives.scene_info import describe_scene, join_infos
 from .avatars.avatar_model import AvatarModel, describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import Avatars, check_owner
@@ -106,7 +105,7 @@ class Scene(QueryMethods):
         self._making = threading.Lock()
         self._own = [each.info for each in avatars]
         for each in avatars:
-            self._avatars.put(each.info.name, each.model)
+            self._avatars.provide(each.info.name, each.model)
 
     @classmethod
     def open(
@@ -124,7 +123,7 @@ class Scene(QueryMethods):
 
         name: for clients; None: the name in the scene file, else that of the file or folder.
         budget_bytes: limit of decoded voxels in memory, all archives together.
-        policy: eviction policy, and whether voxels are prefetched; see eviction.py.
+        policy: eviction policy, and whether voxels are prefetched; see voxel_cache.py.
         open_store: function that opens the folder, now and at each reload; None: `VoxelStore`.
         radius_model: default radius model, see schemas/archive/radius_model.py; None: the archive's
         single radius. `open_store` and `radius_model` are refused for a scene file, which declares

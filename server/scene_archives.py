@@ -28,7 +28,6 @@ from .avatars.avatar_shape import avatar_shape
 from .kernels.core.placed_avatar import MAX_REACH_UNITS
 from .residency.arena import ArenaBuffer
 from .residency.voxel_store import OpenStore, VoxelStore
-from .scene_interface import AvatarShape
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/world/bodies.py).
@@ -43,10 +42,9 @@ class FoundArchive(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """Avatar that a scene file names. shape: of its file, with its final radius.  model: made of it."""
+    """Avatar that a scene file names."""
 
     file: Path
-    shape: AvatarShape
     model: AvatarModel
     info: AvatarInfo
 
@@ -94,9 +92,7 @@ def read_avatars(file: SceneFile, path: Path) -> list[FoundAvatar]:
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
                     "`objects` or `crowd`, under which avatars collide with others"
                 )
-        shape = shape._replace(points=model.points, radius=model.radius)
-        info = describe_avatar(item.name, model, shape.description)
-        found.append(FoundAvatar(avatar_file, shape, model, info))
+        found.append(FoundAvatar(avatar_file, model, describe_avatar(item.name, model, shape.description)))
     return found
 
 
@@ -148,7 +144,7 @@ def open_archives(
     """Place the archives of a scene, which the caller closes.
 
     name: of the scene.  found: by `find_archives`.  budget_bytes: limit of decoded voxels, all archives together.
-    policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
+    policy: eviction policy, see voxel_cache.py.  took: called with the duration of each voxel load
     [s].  level_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """

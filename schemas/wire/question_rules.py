@@ -89,6 +89,18 @@ COMMON: dict[str, ColumnRules] = {
 }
 
 
+def total_cost(answers: Sequence[Cost]) -> dict[str, Any]:
+    """Return the fields of `Cost`: sums, distinct faults and late voxels, the first stop reason."""
+    total: dict[str, Any] = {
+        name: sum([getattr(each, name) for each in answers])
+        for name in ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "wait_seconds")
+    }
+    for name in ("faults", "late"):
+        total[name] = tuple(dict.fromkeys(fact for each in answers for fact in getattr(each, name)))
+    total["stopped"] = next((each.stopped for each in answers if each.stopped), "")
+    return total
+
+
 # The question that each type of answers, or of their parts along a path, belongs to.
 DECLARED: "dict[type[Cost], Question[Any]]" = {}
 
@@ -273,18 +285,10 @@ class Question(Generic[A]):
         for name, rule in self.columns.items():
             columns = [getattr(part, name) for part in parts]
             fields[name] = _joined_starts(columns) if rule.rows is Rows.STARTS else np.concatenate(columns)
-        return self.answers(
-            **fields,
-            engine_seconds=sum(part.engine_seconds for part in parts),
-            hits=sum(part.hits for part in parts),
-            misses=sum(part.misses for part in parts),
-            resident=answered[-1].resident,
-            resident_bytes=answered[-1].resident_bytes,
-            faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
-            wait_seconds=sum(part.wait_seconds for part in parts),
-            late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
-            stopped=next((part.stopped for part in parts if part.stopped), ""),
-        )
+        fields |= total_cost(parts)
+        last = answered[-1]
+        fields |= {"resident": last.resident, "resident_bytes": last.resident_bytes}
+        return self.answers(**fields)
 
     def check(self, answers: A, k: int) -> A:
         """Return the answers if they are valid for k items. Raise InternalError otherwise."""

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.residency.eviction import EvictionPolicy, prefetches
-from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions
-from solidcloud.server.residency.prefetch import SILENCE
+from solidcloud.server.residency.prefetch import PREFETCH_OPTIONS, SILENCE, PrefetchOptions
+from solidcloud.server.residency.voxel_cache import EvictionPolicy, prefetches
 
 from .replay_requests import NOBODY, Requests, Town
 
@@ -296,9 +295,8 @@ class Replay:
         """Update the prefetch queue and the users' positions."""
         self.planned = now
         self.tracks.expire(now, SILENCE)
-        wanted = self.tracks.plan(now, self.usual)
+        self.need = self.tracks.plan(now, self.usual)
         self.kept = frozenset(self.tracks.kept().tolist())
-        self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
         resident = self.resident
         self.queue.clear()
         self.queue.extend(each for each in self.need.items() if each[0] not in resident)

@@ -9,7 +9,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.kernels.core.reach import VoxelTree
 from solidcloud.server.queries.scene_data import make_tree
 from solidcloud.server.report.load.users.user_traces import Centers
-from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
+from solidcloud.server.residency.prefetch import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
 
 # User id of sweeps, which belong to no user and have no position; duration of one sweep through all
 # voxels [s].

@@ -8,6 +8,7 @@ or merged.
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,9 +22,8 @@ from ..queries.path import path_question
 from ..queries.request import QueryBudget, ask_until_stopped, make_budget
 from ..queries.scene_data import SceneData, with_stop
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
-from .placed_archive import PlacedArchive
+from .placed_archive import ArchiveGeneration, PlacedArchive
 
 _A = TypeVar("_A", bound=Cost)
 # Items of a request in the frame of one archive, column by column, and whether the voxels near them
@@ -53,18 +53,11 @@ def hold_archives(
     radius_model: see schemas/archive/radius_model.py; None: that of each archive. Raise BadRequestError.
     """
     held: list[HeldArchive] = []
-    try:
+    with ExitStack() as stack:
         for placed in archives:
-            opened = placed.take()
-            try:
-                data = with_stop(opened.radius_model(radius_model), stop)
-            except BaseException:
-                opened.release()
-                raise
-            held.append(HeldArchive(placed, opened, data))
-    except BaseException:
-        release(held)
-        raise
+            opened = stack.enter_context(placed.take())
+            held.append(HeldArchive(placed, opened, with_stop(opened.radius_model(radius_model), stop)))
+        stack.pop_all()
     return held
 
 

@@ -1,16 +1,16 @@
-"""Changes of what is resident of a scene, as they happen.
+"""What is resident of a scene: the answer of `stats`, and the changes as they happen.
 
-A log (residency/cache_stats.py) collects the changes of each archive under its cache's lock. A
+A log (`ChangeLog`) collects the changes of each archive under its cache's lock. A
 reader takes them at its own rate, so no load or eviction waits for a reader.
 """
 
 import threading
-import weakref
 from collections.abc import Iterator, Sequence
 from time import monotonic
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
@@ -20,18 +20,60 @@ from ...schemas.wire.residency_messages import (
     SILENT_SECONDS,
     ResidencyChanges,
 )
-from ..residency.cache_stats import ChangeLog
-from ..residency.voxel_cache import VoxelCache
-from .archive_generation import ArchiveGeneration
-from .placed_archive import PlacedArchive
+from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
+from ..observability.request_stats import RequestStats, times_of
+from ..residency.voxel_cache import ChangeLog
+from .placed_archive import ArchiveGeneration, PlacedArchive
 
 
-class _Followed(NamedTuple):
-    """Generation of an archive that is followed. It must not be kept in memory by this."""
+def make_stats(
+    name: str,
+    each: Sequence[ArchiveGeneration],
+    metrics: RequestStats,
+    avatars: AvatarStats,
+    *,
+    keys: bool = False,
+) -> StatsAnswer:
+    """Return cache statistics summed over the archives of a scene, and its request statistics.
 
-    number: int
-    cache: "weakref.ref[VoxelCache]"
-    log: ChangeLog
+    metrics: the requests answered so far.  avatars: statistics of the clients' avatars.
+    keys: also list the resident voxels, each by its key in its own archive.
+    """
+    total, users = metrics.snapshot()
+    counts = total.counts
+    residencies = [opened.data.residency for opened in each]
+    level_bytes = sum(opened.level.residency.budget_bytes for opened in each if opened.level)
+    counters = [structs.asdict(residency.counters()) for residency in residencies]
+    loads = [seconds for residency in residencies for seconds in residency.load_times()]
+    return StatsAnswer(
+        scene=name,
+        generation=sum(opened.store.archive.header.generation for opened in each),
+        policy=residencies[0].policy.name,
+        budget_bytes=sum(residency.budget_bytes for residency in residencies) + level_bytes,
+        resident_bytes=sum(residency.resident_bytes for residency in residencies),
+        level_bytes=level_bytes,
+        voxels=sum(len(opened.store.sizes) for opened in each),
+        resident=sum(residency.resident for residency in residencies),
+        kept=sum(len(residency.kept) for residency in residencies),
+        requests=counts.requests,
+        answers=counts.answers,
+        unknown=counts.unknown,
+        waited=counts.waited,
+        load_seconds=times_of(loads, total.loads.times()),
+        stall_seconds=counts.stalls.times(),
+        engine_seconds=total.engine.times(),
+        users=users,
+        keys=sorted(key for opened in each for key in _resident_keys(opened)) if keys else None,
+        avatars=avatars,
+        **{field: sum(own[field] for own in counters) for field in Counters.__struct_fields__},
+    )
+
+
+def _resident_keys(opened: ArchiveGeneration) -> list[int]:
+    """Return the keys of an archive's resident voxels."""
+    rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
+    keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()
+    return keys
 
 
 class ResidencyWatch:
@@ -43,13 +85,15 @@ class ResidencyWatch:
     def __init__(self, archives: Sequence[PlacedArchive]) -> None:
         """Begin to follow archives. Raise BadRequestError if the scene is closed."""
         self._archives = archives
-        self._followed: list[_Followed | None] = [None] * len(archives)
+        # For each archive, the number of the generation that is followed, which this does not keep in
+        # memory, and the log of its cache.
+        self._followed: list[tuple[int, ChangeLog] | None] = [None] * len(archives)
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._seq, self._said = 0, 0.0
         for number, archive in enumerate(archives):
             with archive.take() as opened:
-                self._follow(number, opened)
+                self._followed[number] = opened.number, opened.data.residency.follow()
         self._lost = True  # the first message is the beginning
 
     def __enter__(self) -> Self:
@@ -64,8 +108,7 @@ class ResidencyWatch:
         """End following; `changes` ends. Closing twice is allowed."""
         self._closed.set()
         with self._lock:
-            for number in range(len(self._followed)):
-                self._unfollow(number)
+            self._followed = [None] * len(self._archives)
 
     def __iter__(self) -> Iterator[ResidencyChanges]:
         """Yield the messages of `changes`."""
@@ -98,9 +141,10 @@ class ResidencyWatch:
             for number, archive in enumerate(self._archives):
                 with archive.take() as opened:
                     followed, cache = self._followed[number], opened.data.residency
-                    if followed is None or followed.number != opened.number:
-                        followed, lost = self._follow(number, opened), True
-                    changes, overflowed = cache.take_changes(followed.log)
+                    if followed is None or followed[0] != opened.number:
+                        followed, lost = (opened.number, cache.follow()), True
+                        self._followed[number] = followed
+                    changes, overflowed = cache.take_changes(followed[1])
                     lost |= overflowed
                     resident += cache.resident
                     resident_bytes += cache.resident_bytes
@@ -125,17 +169,3 @@ class ResidencyWatch:
                 resident,
                 resident_bytes,
             )
-
-    def _follow(self, number: int, opened: ArchiveGeneration) -> _Followed:
-        """Follow a generation of an archive, in place of an earlier one."""
-        self._unfollow(number)
-        cache = opened.data.residency
-        followed = _Followed(opened.number, weakref.ref(cache), cache.follow())
-        self._followed[number] = followed
-        return followed
-
-    def _unfollow(self, number: int) -> None:
-        """End following a generation."""
-        followed, self._followed[number] = self._followed[number], None
-        if followed is not None and (cache := followed.cache()) is not None:
-            cache.unfollow(followed.log)

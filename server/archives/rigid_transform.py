@@ -39,8 +39,8 @@ def inverse_pose(pose: Pose) -> Pose:
 
 def rotate_vectors(pose: Pose, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate vectors (n, 3) by the rotation of a pose (4, 4)."""
-    x, y, z = vectors.T
-    return np.stack([(m[0] * x + m[1] * y) + m[2] * z for m in pose[:3]], axis=1)
+    x, y, z = (vectors[:, axis, None] * pose[:3, axis] for axis in range(3))
+    return np.asarray((x + y) + z)
 
 
 def transform_points(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:

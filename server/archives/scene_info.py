@@ -1,7 +1,7 @@
-"""Answers of `info` and `stats`: of an archive, from its header alone, and of a scene of several."""
+"""Answers of `info`: of an archive, from its header alone, and of a scene of several."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -16,14 +16,8 @@ from ...schemas.wire.scene_messages import (
     SourceInfo,
     SpawnInfo,
 )
-from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
-from ..observability.request_stats import RequestStats, times_of
 from ..residency.voxel_store import VoxelStore
 from .rigid_transform import Pose, transform_boxes, transform_poses
-
-if TYPE_CHECKING:
-    from .archive_generation import ArchiveGeneration  # loads all queries; `info` needs none
-
 
 # Fields of `SceneInfo` that are those of the archive's header.
 _AS_STORED = (
@@ -136,53 +130,3 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
     """Return a box (2, 3), or the box that encloses it after transformation by a pose."""
     sides = np.array(box)
     return sides if pose is None else np.concatenate(transform_boxes(pose, sides[:1], sides[1:]))
-
-
-def make_stats(
-    name: str,
-    each: Sequence["ArchiveGeneration"],
-    metrics: RequestStats,
-    avatars: AvatarStats,
-    *,
-    keys: bool = False,
-) -> StatsAnswer:
-    """Return cache statistics summed over the archives of a scene, and its request statistics.
-
-    metrics: the requests answered so far.  avatars: statistics of the clients' avatars.
-    keys: also list the resident voxels, each by its key in its own archive.
-    """
-    total, users = metrics.snapshot()
-    counts = total.counts
-    residencies = [opened.data.residency for opened in each]
-    level_bytes = sum(opened.level.residency.budget_bytes for opened in each if opened.level)
-    counters = [structs.asdict(residency.counters()) for residency in residencies]
-    loads = [seconds for residency in residencies for seconds in residency.load_times()]
-    return StatsAnswer(
-        scene=name,
-        generation=sum(opened.store.archive.header.generation for opened in each),
-        policy=residencies[0].policy.name,
-        budget_bytes=sum(residency.budget_bytes for residency in residencies) + level_bytes,
-        resident_bytes=sum(residency.resident_bytes for residency in residencies),
-        level_bytes=level_bytes,
-        voxels=sum(len(opened.store.sizes) for opened in each),
-        resident=sum(residency.resident for residency in residencies),
-        kept=sum(len(residency.kept) for residency in residencies),
-        requests=counts.requests,
-        answers=counts.answers,
-        unknown=counts.unknown,
-        waited=counts.waited,
-        load_seconds=times_of(loads, total.loads.times()),
-        stall_seconds=counts.stalls.times(),
-        engine_seconds=total.engine.times(),
-        users=users,
-        keys=sorted(key for opened in each for key in _resident_keys(opened)) if keys else None,
-        avatars=avatars,
-        **{field: sum(own[field] for own in counters) for field in Counters.__struct_fields__},
-    )
-
-
-def _resident_keys(opened: "ArchiveGeneration") -> list[int]:
-    """Return the keys of an archive's resident voxels."""
-    rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
-    keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()
-    return keys

@@ -7,12 +7,12 @@ from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ...schemas.wire.encoding import avatar_digest
 from ...schemas.wire.key_expressions import check_name
-from ...schemas.wire.requests import check_avatar_name, make_positions
+from ...schemas.wire.requests import check_avatar_name
 from ...schemas.wire.stats import AvatarStats
 from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar
@@ -92,29 +92,38 @@ class Avatars:
         check_owner(client)
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 
-    def add(
-        self, name: str, points: ArrayLike, radius: float | None, client: str, inner_points: int = 0
-    ) -> AvatarModel:
-        """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
+    def provide(self, name: str, model: AvatarModel) -> None:
+        """Store an avatar of the scene file, for all clients."""
+        with self._lock:
+            self._clients.setdefault(EVERYBODY, {})[name] = _Entry(model, model.radius, bytes_of(model))
 
-        radius, inner_points: as for `make_avatar`. An avatar with the name of a scene avatar must
-        equal it, and shares its arrays. Of two requests that add the same avatar at a time, both build
-        it and one is stored. Raise BadRequestError if a name is invalid or belongs to a different
-        avatar, TooLargeError beyond the limits.
+    def add(
+        self,
+        name: str,
+        points: NDArray[np.float64],
+        radius: float | None,
+        client: str,
+        inner_points: int = 0,
+    ) -> AvatarModel:
+        """Build an avatar of points and store it, unless the same one exists already.
+
+        points: (n, 3) float64, checked [m].  radius, inner_points: as for `make_avatar`.
+        An avatar with the name of a scene avatar must equal it, and shares its arrays. Of two requests
+        that add the same avatar at a time, both build it and one is stored. Raise BadRequestError if a
+        name is invalid or belongs to a different avatar, TooLargeError beyond the limits.
         """
         check_avatar_name(name)
         check_owner(client)
-        array = make_positions(points)
         with self._lock:
             entry = self._clients.get(client, {}).get(name)
             shared = self._clients.get(EVERYBODY, {}).get(name)
         if entry is None:
             if shared is None:
-                self._check_room(name, client, len(array), _LEAST_BYTES + _BYTES_A_POINT * len(array))
-                model = self._build(array, radius, inner_points)
+                self._check_room(name, client, len(points), _LEAST_BYTES + _BYTES_A_POINT * len(points))
+                model = self._build(points, radius, inner_points)
                 size = bytes_of(model)
             else:
-                self._check_same(name, shared, array, radius, inner_points)
+                self._check_same(name, shared, points, radius, inner_points)
                 model, size = shared.model, _LEAST_BYTES
             if client != EVERYBODY:
                 digest = avatar_digest(model.points, model.radius, model.inner_points)
@@ -122,16 +131,10 @@ class Avatars:
             with self._lock:
                 entry = self._clients.get(client, {}).get(name)
                 if entry is None:
-                    self._check_room(name, client, len(array), size)
+                    self._check_room(name, client, len(points), size)
                     entry = self._clients.setdefault(client, {})[name] = _Entry(model, radius, size)
-        self._check_same(name, entry, array, radius, inner_points)
+        self._check_same(name, entry, points, radius, inner_points)
         return entry.model
-
-    def put(self, name: str, model: AvatarModel) -> None:
-        """Store an avatar of the scene file."""
-        with self._lock:
-            entry = _Entry(model, model.radius, bytes_of(model))
-            self._clients.setdefault(EVERYBODY, {})[name] = entry
 
     def _build(self, points: NDArray[np.float64], radius: float | None, inner_points: int = 0) -> AvatarModel:
         with self._large if len(points) > _LARGE else nullcontext():

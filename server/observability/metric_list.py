@@ -1,7 +1,7 @@
 """Table of the metrics that a monitoring system reads: the figures of `stats`.
 
 Each is a field of `StatsAnswer`, or of `UserStats` for each user. To add a metric, add the field in
-schemas/wire/stats.py, count it in request_stats.py or server/residency/cache_stats.py, and add a
+schemas/wire/stats.py, count it in request_stats.py or server/residency/voxel_cache.py, and add a
 row here. prometheus_export.py serves the list.
 """
 

@@ -89,7 +89,7 @@ class QueryBudget(NamedTuple):
     the centres; a millimetre is allowed at any distance if it is above 0.
     deadline: on time.perf_counter()'s clock [s], inf for none. It sets `stop`.
     scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
-    the cache (eviction.py).
+    the cache (`EvictionPolicy`).
     stop: ends the work early once it is set; what was not examined by then is unknown.
     request: the flag of the whole request, which its deadline does not set: for its broad phase.
     late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such

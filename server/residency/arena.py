@@ -1,20 +1,18 @@
 """Arena: one buffer that holds all resident voxels, and the assignment of its bytes to them.
 
+It knows neither records nor requests: voxel_cache.py remembers which voxels are resident or failed.
 Not thread-safe: `VoxelCache` calls it under its lock.
 """
 
 import bisect
 import ctypes
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..kernels.core.scene_arrays import Arena
-from .cache_stats import CacheStats
-from .eviction import EvictionPolicy
 
 ALIGNMENT = 64  # a cache line: a row of the arena straddles as few cache lines as possible
 # Number of runs on either side of an offset that are searched for free bytes to join. The limit
@@ -25,7 +23,7 @@ AROUND = 32
 # voxel may replace many small ones, and loading it takes long enough to justify the longer search.
 AROUND_SIZES = 16
 # Number of victims that a search finds beyond those it needs. Every search skips the pinned voxels
-# at the front of the policy's order again, so it is not repeated for each victim.
+# at the front of the order again, so it is not repeated for each victim.
 SPARE_VICTIMS = 32
 # Share of the buffer that may be evicted beyond the requested bytes before all runs are searched.
 SLACK = 1 / 32
@@ -59,38 +57,37 @@ class VoxelAllocator:
     the free bytes between two runs. A voxel gets the beginning of the shortest gap that suffices; of
     equals, of the one at the lowest offset.
     offsets: row -> byte offset.  used_bytes: the total of all runs.
-    where: (v, 3) int64, see `VoxelCache`.  sizes: bytes of each row, rounded with
-    `ArenaBuffer.rounded`.  pins, loading: rows in use, which are neither evicted nor moved.
+    where: (v, 3) int64, see `VoxelCache`.  moved_bytes: of the voxels moved so far.
+    sizes: bytes of each row, rounded with `ArenaBuffer.rounded`.
+    victims: returns the resident rows in order of eviction.  on_evict: called with each evicted row.
+    pins, loading: rows in use, which are neither evicted nor moved.
     """
 
     def __init__(
         self,
-        buffer: ArenaBuffer,
+        budget_bytes: int,
         sizes: list[int],
-        where: NDArray[np.int64],
-        policy: EvictionPolicy,
-        stats: CacheStats,
+        victims: Callable[[], Iterable[int]],
+        on_evict: Callable[[int], None],
         pins: Collection[int],
         loading: Collection[int],
     ) -> None:
-        """Begin with an empty `buffer`."""
-        self.buffer, self.sizes, self.where, self.policy, self.stats = buffer, sizes, where, policy, stats
-        self._pins, self._loading = pins, loading
+        """Begin with an empty buffer of `budget_bytes`."""
+        self.buffer, self.sizes = ArenaBuffer(budget_bytes), sizes
+        self.where = np.full((len(sizes), 3), -1, np.int64)
+        self._ordered, self._on_evict, self._pins, self._loading = victims, on_evict, pins, loading
         self.offsets: dict[int, int] = {}
-        self.used_bytes = 0
-        self._address = buffer.arena.halves.ctypes.data
+        self.used_bytes = self.moved_bytes = 0
+        self._address = self.buffer.arena.halves.ctypes.data
         self._runs: list[tuple[int, int]] = []  # (offset, row), ascending
         self._gaps: list[tuple[int, int]] = []  # (bytes, offset), ascending, of those with bytes
         self._add_gap(0)
 
-    def allocate(
-        self, row: int, keeps: Callable[[int], bool], *, scan: bool, most: int | None = None
-    ) -> bool:
-        """Allocate a run for a voxel without one, evicting others in the policy's order if needed.
+    def allocate(self, row: int, keeps: Callable[[int], bool], most: int | None = None) -> bool:
+        """Allocate a run for a voxel without one, evicting others in order if needed.
 
         Return whether the voxel has a run now.
         keeps: whether to evict no voxel of a row, besides those in use.
-        scan: see `EvictionPolicy.added`.
         most: limit of rows examined to find victims; None: all rows.
         Nothing is evicted if evicting everything allowed would free too few bytes. If free bytes
         are fragmented, more voxels are evicted than the size requires. If voxels that must stay lie
@@ -108,7 +105,6 @@ class VoxelAllocator:
         self._add_gap(number + 1)
         self.offsets[row] = offset
         self.used_bytes += size
-        self.policy.added(row, size, scan=scan)
         return True
 
     def forget(self, row: int) -> int:
@@ -121,7 +117,6 @@ class VoxelAllocator:
         del self._runs[number]
         self._add_gap(number)
         self.used_bytes -= self.sizes[row]
-        self.policy.removed(row)
         return offset
 
     def evict_all_but(self, rows: Collection[int]) -> None:
@@ -167,12 +162,12 @@ class VoxelAllocator:
 
     def _victims(self, keeps: Callable[[int], bool], most: int | None) -> Iterator[int]:
         """Iterate over the rows that may be evicted, in order."""
-        rows = islice(self.policy.victims(), most)
+        rows = islice(self._ordered(), most)
         return (row for row in rows if self._is_free(row) and not keeps(row))
 
     def _evict(self, row: int) -> int:
         """Evict a voxel; return the offset of its run."""
-        self.stats.count_eviction(row)
+        self._on_evict(row)
         return self.forget(row)
 
     def _clear(self, size: int, keeps: Callable[[int], bool], most: int | None) -> int | None:
@@ -277,7 +272,7 @@ class VoxelAllocator:
                 self._runs[number] = (to, row)
                 self.offsets[row] = to
                 self.where[row] -= (shift // 4, shift // 4, shift // 2)
-                self.stats.moved_bytes += size
+                self.moved_bytes += size
             to += size
         self._add_gap(end)
         return to
@@ -289,4 +284,3 @@ class VoxelAllocator:
         assert all(size >= 0 for size, _ in gaps) and self._gaps == sorted(gap for gap in gaps if gap[0])
         assert self.used_bytes == sum(self.sizes[row] for row in self.offsets)
         assert self.used_bytes + sum(size for size, _ in gaps) == self.buffer.total_bytes
-        assert sorted(self.policy.victims()) == sorted(self.offsets)

@@ -4,7 +4,7 @@ schemas/archive/level.py says what a level is. Its voxels are small, a thirtieth
 and lie in a cache of their own, so that voxels of the archive do not displace them.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from ...schemas.archive.level import open_level
@@ -54,21 +54,9 @@ def open_level_store(store: VoxelStore, budget_bytes: int, level_bytes: int | No
     return LevelStore(found, VoxelCache(found, most), every <= most)
 
 
-def level_filler(level: LevelStore | None) -> Callable[[], bool] | None:
-    """Return a function that loads the next voxel of a level; None if not all of them fit.
-
-    It returns False when all are loaded.
-    """
-    if level is None or not level.fits:
-        return None
-    rows = iter(range(len(level.store.sizes)))
-
-    def fill_one() -> bool:
-        row = next(rows, None)
-        if row is None:
-            return False
+def fill_level(level: LevelStore) -> Iterator[None]:
+    """Load all voxels of a level that fits, one at a step."""
+    for row in range(len(level.store.sizes)):
         # An unreadable voxel is reported by the request that loads it.
         level.residency.load_in_background(row, lambda _: False)
-        return True
-
-    return fill_one
+        yield

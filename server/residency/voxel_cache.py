@@ -1,9 +1,9 @@
-"""Cache of resident voxels, decoded, within `budget_bytes`: pins, loads and waits of requests.
+"""Cache that remembers the state of each voxel: resident, being loaded, or failed, and with which fault.
 
 [Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue".
 A voxel is loaded once, however many requests wait for it, and the voxels of a request are pinned
-until it is answered. eviction.py selects the voxels to evict, arena.py assigns bytes, and
-prefetch.py loads voxels before a request needs them.
+until it is answered. `EvictionPolicy` orders the voxels to evict, arena.py assigns bytes,
+voxel_store.py decodes a record into them, and prefetch.py loads voxels before a request needs them.
 
 A voxel is in one of four states:
 
@@ -21,25 +21,206 @@ that each hold half of what the other needs therefore cannot deadlock.
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 
 from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
-from ...schemas.wire.residency_messages import Residency
+from ...schemas.wire.residency_messages import MAX_CHANGED_VOXELS, Residency
 from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .arena import ArenaBuffer, VoxelAllocator
-from .cache_stats import CacheStats, ChangeLog
-from .eviction import EvictionPolicy
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurns
 from .voxel_store import VoxelStore
 
+POLICIES = ("lru", "lru+prefetch")
+
+# Share of the budget that scans may fill while other requests need room. Scans are sweeps along a
+# path, and requests right after a teleport. Without a limit, one sweep through the archive evicts
+# the voxels around every user. Measured with
+# `scripts/simulate_cache --sweeps 10 --kinds stroll`, ten sweeps in five minutes beside eight
+# strolling users in a town of 4e7 points: these users miss 362 voxels, 440 if sweeps are not marked
+# as scans, and 326 without sweeps.
+SCAN_SHARE = 0.1
 # Voxels examined to find room for a prefetched one.
 MAX_CANDIDATES = 256
+# A voxel requested again within this time after its eviction was evicted too soon
+# (`Counters.too_soon`) [s].
+TOO_SOON = 10.0
+# Number of evictions whose times are kept.
+MAX_EVICTION_TIMES = 1 << 14
+# Number of loads whose durations are kept.
+MAX_LOAD_TIMES = 256
+
+
+def prefetches(name: str) -> bool:
+    """Return whether voxels are prefetched under this policy."""
+    return name == "lru+prefetch"
+
+
+class EvictionPolicy:
+    """Order of eviction: least recently used first, with a bounded share for scans ([Fig12] section 4).
+
+    Rows are index rows of voxels; a row is added at most once before it is removed. A row added by
+    a scan is also in a separate queue until another request uses it. While that queue holds more
+    than SCAN_SHARE of the budget, its oldest rows are evicted before all others; within that share
+    its rows are treated like the rest.
+
+    The class knows no pins, prefetches, threads or clock, and scripts/simulate_cache replays traces with
+    it. Another policy would be another class with these four methods. Two were measured, and the order
+    hardly matters once voxels are prefetched (server/DESIGN.md, "Prefetching").
+    """
+
+    def __init__(self, budget_bytes: int, name: str = "lru") -> None:
+        """Begin without rows. Raise BadRequestError for an unknown name."""
+        if name not in POLICIES:
+            raise BadRequestError(f"policy {name!r}: expected one of {', '.join(POLICIES)}")
+        self.name = name
+        # row -> bytes, of all rows; least recently used first
+        self._order: OrderedDict[int, int] = OrderedDict()
+        self._scans: OrderedDict[int, int] = OrderedDict()  # the same, of rows used by scans only
+        self._scan_bytes = 0
+        self._max_scan_bytes = int(budget_bytes * SCAN_SHARE)
+
+    def added(self, row: int, size: int, *, scan: bool) -> None:
+        """Record that `size` bytes were allocated to a row.
+
+        scan: whether a scan requested the row; False for a prefetch.
+        """
+        self._order[row] = size
+        if scan:
+            self._scans[row] = size
+            self._scan_bytes += size
+
+    def used(self, row: int, *, scan: bool) -> None:
+        """Record that a row that is resident or being loaded was requested."""
+        self._order.move_to_end(row)
+        if row in self._scans:
+            if scan:
+                self._scans.move_to_end(row)
+            else:
+                self._scan_bytes -= self._scans.pop(row)
+
+    def removed(self, row: int) -> None:
+        """Record that the bytes of a row were released: it was evicted, or was never loaded."""
+        del self._order[row]
+        self._scan_bytes -= self._scans.pop(row, 0)
+
+    def victims(self) -> Iterator[int]:
+        """Iterate over all rows with allocated bytes in order of eviction, each once.
+
+        The order is computed during the iteration, which any other call invalidates.
+        """
+        over = self._scan_bytes - self._max_scan_bytes
+        named: set[int] = set()
+        if over > 0:
+            for row, size in self._scans.items():
+                named.add(row)
+                yield row
+                over -= size
+                if over <= 0:
+                    break
+        for row in self._order:
+            if row not in named:
+                yield row
+
+
+@dataclass(slots=True, weakref_slot=True, eq=False)
+class ChangeLog:
+    """Latest change of each voxel since a reader last took them, bounded in size.
+
+    changes: state of each changed voxel by index row.  overflowed: whether more voxels changed.
+    """
+
+    changes: dict[int, Residency] = field(default_factory=dict)
+    overflowed: bool = False
+
+    def add(self, row: int, state: Residency) -> None:
+        """Note a change; a further one of the same voxel replaces it."""
+        if len(self.changes) < MAX_CHANGED_VOXELS or row in self.changes:
+            self.changes[row] = state
+        else:
+            self.overflowed = True
+
+
+class CacheStats:
+    """Counts of a voxel cache, with the names of `Counters`, which documents them.
+
+    fresh: rows prefetched or being prefetched that no request has used yet.
+    times: durations of the last loads [s].  logs: of readers that follow the changes.
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        """Begin with zero counts. sizes: bytes of each row."""
+        self._sizes = sizes
+        self.hits = self.waits = self.misses = self.late = self.failed = self.too_soon = self.evicted = 0
+        self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
+        self.fresh: set[int] = set()
+        self.times: deque[float] = deque(maxlen=MAX_LOAD_TIMES)
+        self.logs: WeakSet[ChangeLog] = WeakSet()
+        self._evicted_at: dict[int, float] = {}  # row -> time of its last eviction, in order of time
+
+    def count_used(self, rows: Sequence[int]) -> None:
+        """Count requested voxels that were resident or loading."""
+        self.hits += len(rows)
+        if self.fresh:
+            known = self.fresh.intersection(rows)
+            self.fresh -= known
+            self.used += len(known)
+
+    def count_missed(self, rows: Sequence[int]) -> None:
+        """Count requested voxels that the request itself loads."""
+        self.misses += len(rows)
+        since = time.perf_counter() - TOO_SOON
+        self.too_soon += sum(self._evicted_at.get(row, -math.inf) > since for row in rows)
+
+    def count_prefetch(self, row: int) -> None:
+        """Count a prefetch that begins."""
+        self.fresh.add(row)
+        self.prefetched += 1
+        self.prefetched_bytes += self._sizes[row]
+
+    def count_load(self, row: int, seconds: float) -> None:
+        """Count a load that took `seconds`."""
+        self.times.append(seconds)
+        self._note(row, Residency.PREFETCHED if row in self.fresh else Residency.LOADED)
+
+    def count_failure(self, row: int) -> None:
+        """Count a failed load."""
+        self.failed += 1
+        self._count_wasted(row)
+
+    def count_eviction(self, row: int) -> None:
+        """Count the eviction of a voxel."""
+        self.evicted += 1
+        self._note(row, Residency.WASTED if row in self.fresh else Residency.EVICTED)
+        self._count_wasted(row)
+        self._evicted_at.pop(row, None)
+        self._evicted_at[row] = time.perf_counter()
+        if len(self._evicted_at) > MAX_EVICTION_TIMES:
+            del self._evicted_at[next(iter(self._evicted_at))]
+
+    def _count_wasted(self, row: int) -> None:
+        """Count a wasted prefetch if the voxel was prefetched and no request has used it."""
+        if row in self.fresh:
+            self.fresh.discard(row)
+            self.wasted += 1
+            self.wasted_bytes += self._sizes[row]
+
+    def _note(self, row: int, state: Residency) -> None:
+        for log in self.logs:
+            log.add(row, state)
+
+    def check(self) -> None:
+        """Assert that the counts add up."""
+        assert self.used + self.wasted + len(self.fresh) == self.prefetched
+        assert self.waits <= self.hits and self.too_soon <= self.misses
 
 
 class HeldVoxels(NamedTuple):
@@ -118,13 +299,11 @@ class VoxelCache:
                 f"cache of {budget_bytes} bytes: the largest voxel takes {largest}: give a larger --cache, "
                 "or build with a smaller --voxel"
             )
-        self.budget_bytes, self.buffer = budget_bytes, ArenaBuffer(budget_bytes)
-        self.where = np.full((len(sizes), 3), -1, np.int64)
+        self.budget_bytes = budget_bytes
         self.kept: frozenset[int] = frozenset()
         self.on_owed: Callable[[], None] | None = None
         self.on_load_time: Callable[[float], None] | None = None
         self.misled = False
-        self.policy = policy or EvictionPolicy(budget_bytes)
         self._store = store
         self._sizes = [size if size <= budget_bytes else 0 for size in sizes]
         self._pins: dict[int, int] = {}  # row -> number of holds
@@ -136,10 +315,17 @@ class VoxelCache:
         }
         self._passing: set[int] = set()  # rows whose fault ends with the last hold
         self._owed: dict[int, None] = {}  # rows that requests did not get in time, in that order
-        self.stats = CacheStats(self._sizes)
+        self.policy = order = policy or EvictionPolicy(budget_bytes)
+        self.stats = counts = CacheStats(self._sizes)
+
+        def on_evict(row: int) -> None:  # no method: a reference to itself would keep the memory
+            counts.count_eviction(row)
+            order.removed(row)
+
         self._allocator = VoxelAllocator(
-            self.buffer, self._sizes, self.where, self.policy, self.stats, self._pins, self._loading
+            budget_bytes, self._sizes, order.victims, on_evict, self._pins, self._loading
         )
+        self.buffer, self.where = self._allocator.buffer, self._allocator.where
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._turns = LoadTurns()
@@ -158,7 +344,7 @@ class VoxelCache:
         `late`. No load begins after it; a load that has begun is finished. -inf: no load is begun
         or waited for, and nothing is evicted.
         scan: the voxels are used in passing and should not displace those that others use
-        repeatedly (eviction.py).
+        repeatedly (`EvictionPolicy`).
         stop: setting it has the effect of the deadline.
         """
         return Hold(self, rows, deadline, scan, stop)
@@ -277,8 +463,9 @@ class VoxelCache:
         there = [row for row in rows if self.is_resident(row) and row not in new]
         self.use(there, scan=scan)
         self.stats.count_missed(mine)
-        self.stats.count_waits(there, self._loading)
-        return len(there), len(mine), not self._loading.isdisjoint(there)
+        waits = sum(row in self._loading for row in there)
+        self.stats.waits += waits
+        return len(there), len(mine), waits > 0
 
     def _wait(self, deadline: float, stop: StopFlag) -> bool:
         """Wait until another thread changes the state; return False at the deadline or on stop."""
@@ -288,12 +475,10 @@ class VoxelCache:
         return seconds_to(deadline, stop) != 0
 
     def _pin(self, rows: Sequence[int]) -> None:
-        """Begin a hold on rows."""
         for row in rows:
             self._pins[row] = self._pins.get(row, 0) + 1
 
     def _unpin(self, rows: Sequence[int]) -> None:
-        """End a hold on rows."""
         for row in rows:
             self._pins[row] -= 1
             if not self._pins[row]:
@@ -309,7 +494,6 @@ class VoxelCache:
         return row in self._allocator.offsets
 
     def _absent(self, rows: Iterable[int]) -> list[int]:
-        """Return the rows that are absent."""
         return [row for row in rows if not self.is_resident(row) and row not in self._faults]
 
     def _sort_out(self, rows: Sequence[int]) -> tuple[list[int], tuple[str, ...], tuple[int, ...]]:
@@ -341,16 +525,22 @@ class VoxelCache:
         try:
             for row in rows:
                 if not (
-                    self._allocator.allocate(row, self.kept.__contains__, scan=scan)
-                    or self._allocator.allocate(row, lambda _: False, scan=scan)
+                    self._allocator.allocate(row, self.kept.__contains__)
+                    or self._allocator.allocate(row, lambda _: False)
                 ):
                     break
+                self.policy.added(row, self._sizes[row], scan=scan)
                 done += 1
         finally:
             if done < len(rows):
                 for row in rows[:done]:
-                    self._allocator.forget(row)
+                    self._forget(row)
         return done == len(rows)
+
+    def _forget(self, row: int) -> None:
+        """Release the bytes of a voxel that was not loaded."""
+        self._allocator.forget(row)
+        self.policy.removed(row)
 
     # --- loads ---
 
@@ -369,7 +559,7 @@ class VoxelCache:
                 with self._lock:
                     for row in rows[done:]:
                         self._loading.discard(row)
-                        self._allocator.forget(row)
+                        self._forget(row)
                     self._changed.notify_all()
 
     def _load_one(self, row: int) -> bool:
@@ -402,7 +592,7 @@ class VoxelCache:
     def _fail(self, row: int, fault: str, corrupt: bool) -> None:
         """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
         self.stats.count_failure(row)
-        self._allocator.forget(row)
+        self._forget(row)
         if corrupt or row in self._pins:
             self._faults[row] = fault
             if not corrupt:
@@ -433,9 +623,10 @@ class VoxelCache:
                 return BackgroundLoad.FAILED
             kept = self.kept
             if not self._allocator.allocate(
-                row, lambda other: other in kept or not may_evict(other), scan=False, most=MAX_CANDIDATES
+                row, lambda other: other in kept or not may_evict(other), MAX_CANDIDATES
             ):
                 return BackgroundLoad.NO_ROOM
+            self.policy.added(row, self._sizes[row], scan=False)
             self._loading.add(row)
             if not owed:
                 self.stats.count_prefetch(row)
@@ -453,11 +644,6 @@ class VoxelCache:
         """Return the bytes of the voxels resident or being loaded."""
         return self._allocator.used_bytes
 
-    @property
-    def evictions(self) -> int:
-        """Return the number of voxels evicted to make room for others."""
-        return self.stats.evicted
-
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Return the bytes that these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
@@ -470,7 +656,8 @@ class VoxelCache:
     def counters(self) -> Counters:
         """Return the statistics of the cache."""
         with self._lock:
-            return self.stats.counters()
+            counts = {name: getattr(self.stats, name, 0) for name in Counters.__struct_fields__}
+            return Counters(**counts | {"moved_bytes": self._allocator.moved_bytes})
 
     def load_times(self) -> list[float]:
         """Return the durations of the last loads [s], unordered."""
@@ -478,26 +665,24 @@ class VoxelCache:
             return list(self.stats.times)
 
     def follow(self) -> ChangeLog:
-        """Return a log of all changes from now on, until `unfollow`."""
+        """Return a log of all changes from now on, as long as a reader refers to it."""
         log = ChangeLog()
         with self._lock:
-            self.stats.logs += (log,)
+            self.stats.logs.add(log)
         return log
-
-    def unfollow(self, log: ChangeLog) -> None:
-        """End a log."""
-        with self._lock:
-            self.stats.logs = tuple(other for other in self.stats.logs if other is not log)
 
     def take_changes(self, log: ChangeLog) -> tuple[dict[int, Residency], bool]:
         """Return the changes in a log, by index row, and whether some are missing; begin it anew."""
         with self._lock:
-            return log.take()
+            found = log.changes, log.overflowed
+            log.changes, log.overflowed = {}, False
+        return found
 
     def check(self) -> None:
         """Assert the invariants between two operations: bytes add up, and runs do not overlap."""
         with self._lock:
             self._allocator.check()
+            assert sorted(self.policy.victims()) == sorted(self._allocator.offsets)
             offsets = set(self._allocator.offsets)
             resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
             assert resident == offsets - self._loading and self._loading <= offsets

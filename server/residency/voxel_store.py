@@ -1,4 +1,7 @@
-"""Decoder that writes the voxel of an index row into the arena. Thread-safe."""
+"""Store that reads and decodes voxels of an archive into the arena. It remembers none, and no failure.
+
+Thread-safe. voxel_cache.py calls it, and remembers what is resident and what could not be loaded.
+"""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.tile_messages import VoxelsAnswer, VoxelsRequest
-from ..archives.archive_generation import ArchiveGeneration
-from ..archives.placed_archive import PlacedArchive
+from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
 from ..archives.rigid_transform import transform_points
 
 Floats = NDArray[np.float64]

@@ -96,7 +96,7 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
             assert answers.verdict.tolist() == [1, 1, 0] and not answers.voxels_missing.any()
             assert answers.resident_bytes <= voxels * one + 64
             # No storm: a voxel is read at most once for each pose.
-            assert answers.misses <= 3 * 512 and scene.residency.evictions <= answers.misses
+            assert answers.misses <= 3 * 512 and scene.residency.stats.evicted <= answers.misses
             scene.residency.check()
 
 

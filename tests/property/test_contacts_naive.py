@@ -124,7 +124,7 @@ def test_cells_that_grow_and_voxels_that_do_not_fit_together_say_the_same(
         avatar, radius, poses, limit, margin = rich_question(rich, seed)
         small = tight(rich, 3 * largest)
         answers = compare(small, avatar, radius, rng.permutation(poses), limit, margin)
-        assert small.data.residency.evictions > 0 and answers.misses > 3
+        assert small.data.residency.stats.evicted > 0 and answers.misses > 3
 
 
 def listed(answers: ContactsAnswers, pose: int) -> list[tuple[float, ...]]:

@@ -144,7 +144,7 @@ def test_the_same_wishes_give_the_same_bits_whatever_is_in_memory(
                 poses.append(body.pose.tobytes())
             walks.append(poses)
             residency = game.scene.residency
-            assert (residency.evictions > 0) == (budget < 1 << 26)
+            assert (residency.stats.evicted > 0) == (budget < 1 << 26)
             # What one motion reaches fits, and not much more.
             budget = residency.bytes_of(range(len(residency.where))) // 3
     assert walks[0] == walks[1]

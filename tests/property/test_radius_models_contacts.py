@@ -112,7 +112,7 @@ def test_growing_cells_and_a_small_cache_say_the_same(
     assert found.max() > 20
     small = tight(case, 3 * int(case.store.sizes.max()))
     compare(small, avatar, radius, poses, limit, margin, 0.05)
-    assert small.data.residency.evictions > 0
+    assert small.data.residency.stats.evicted > 0
 
 
 def test_spheres_that_are_large_elsewhere_cost_no_point_tests(rich: ScanCase) -> None:

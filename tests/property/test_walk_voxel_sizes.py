@@ -72,4 +72,4 @@ def test_a_cache_of_a_few_voxels_changes_no_walk(archives: list[Path]) -> None:
         expected = walks(game).tobytes()
     with play(archives[0], *EFFECTS, budget_bytes=budget, level_bytes=0) as game:
         assert walks(game).tobytes() == expected
-        assert game.scene.residency.evictions > 100
+        assert game.scene.residency.stats.evicted > 100

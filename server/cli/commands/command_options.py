@@ -131,10 +131,10 @@ def avatar_options(
 
 def read_avatar_points(file: Path, avatar_up: str | None, avatar_units: str | None) -> "NDArray[np.float64]":
     """Read the points (n, 3) of an avatar's file or the vertices of a mesh [m]; print what was taken."""
-    from ...avatars.avatar_file import read_avatar_file
+    from ...avatars.avatar_shape import read_avatar
     from ...scene_interface import AvatarShape
 
-    read = read_avatar_file(file, avatar_up, avatar_units)
+    read = read_avatar(file, avatar_up, avatar_units)
     print_avatar(file, AvatarShape(read.points, None, 0, f"points or vertices: a surface; {read.axes}"))
     return read.points
 

@@ -125,7 +125,7 @@ def query(
     error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
-    from ...avatars.avatar_file import read_avatar
+    from ...avatars.avatar_shape import read_avatar
     from ...client import Client
     from ..input.query_input import ask, check_query, joined
     from ..output.answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
@@ -136,7 +136,7 @@ def query(
         return _ask_moves(connect, scene, question, avatars, as_json, key_file)
     found, asked, printed = [], 0, 0
     with Client(connect, scene=scene, key_file=key_file) as client:
-        for part in ask(client, question, read_avatar, avatars.read):
+        for part in ask(client, question, lambda points: read_avatar(points).points, avatars.read):
             found.append(part)
             asked += len(part.labels)
             if as_json or client.unanswered == asked:

@@ -102,7 +102,10 @@ def _find_spawn(file: SceneFile, out: Path, name: str) -> tuple[Sequence[float] 
     """
     with ExitStack() as stack:
         found = find_archives(file, out, stack)
-        given = {each.info.name: each.shape for each in read_avatars(file, out)}
+        given = {
+            each.info.name: AvatarShape(each.model.points, each.model.radius, each.model.inner_points)
+            for each in read_avatars(file, out)
+        }
         who = ", ".join(given)
         if not given:
             given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"

@@ -13,7 +13,7 @@ from ....builder.synthetic.scenes import make_facade
 from ....builder.synthetic.walk import walk_poses
 from ....schemas.archive.archive import Archive
 from ....schemas.errors import BadRequestError
-from ...avatars.avatar_file import read_avatar
+from ...avatars.avatar_shape import read_avatar
 from ...cli.input.pose_file import read_poses
 
 PAPER_POINTS = 587_923
@@ -62,7 +62,7 @@ def given_case(
     if archive is not None:
         scans, name = [folder / "points.ply"], archive.resolve().name
         step = write_points(archive, scans[0])
-    body = figure_points() if avatar is None else read_avatar(avatar)
+    body = figure_points() if avatar is None else read_avatar(avatar).points
     times, walk = read_poses(poses)
     if not len(walk):
         raise BadRequestError(f"{poses}: no poses, expected at least one: give a file with poses")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.residency_messages import Residency, ResidencyChanges
-from solidcloud.server.residency import cache_stats
+from solidcloud.server.residency import voxel_cache
 from solidcloud.server.scene import Scene
 
 AVATAR = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
@@ -81,7 +81,7 @@ def test_changes_follow_the_cache(case: archive_cases.Case) -> None:
 def test_changes_beyond_the_limit_are_said_to_be_lost(
     case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cache_stats, "MAX_CHANGED_VOXELS", 2)
+    monkeypatch.setattr(voxel_cache, "MAX_CHANGED_VOXELS", 2)
     rng = np.random.default_rng(3)
     with opened(case) as scene, scene.residency_changes() as changes:
         changes.take()

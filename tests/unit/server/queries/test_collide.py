@@ -75,7 +75,7 @@ def test_a_pose_over_the_budget_is_looked_at_in_pieces(tmp_path: Path, rng: np.r
             scene.add_avatar("avatar", avatar, 0.02)
             answers = scene.collide("avatar", poses)
             assert answers.verdict.tolist() == whole.verdict.tolist()
-            assert (answers.voxels_missing == 0).all() and scene.residency.evictions > 0
+            assert (answers.voxels_missing == 0).all() and scene.residency.stats.evicted > 0
             assert answers.resident_bytes <= budget
             scene.residency.check()
 

@@ -16,8 +16,8 @@ import pytest
 import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.server.archives.archive_generation import ArchiveGeneration
 from solidcloud.server.archives.masked_store import MaskedStore
+from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.core.normal_codes import LINE, THICK
 from solidcloud.server.kernels.rays.surface import voxels_near
 from solidcloud.server.queries.scene_data import with_stop
@@ -151,7 +151,7 @@ def test_normals_are_the_same_in_voxels_of_any_size_and_with_room_for_one(tmp_pa
         with asked(archive, budget) as (opened, normals):
             found = [normals.at(place, UP, REACH) for place in places]
             heights = [normals.highest(place, np.eye(3), REACH) for place in places]
-            assert (opened.data.residency.evictions > 0) == (budget < 1 << 24)
+            assert (opened.data.residency.stats.evicted > 0) == (budget < 1 << 24)
         return [b"" if each is None else each.tobytes() for each in (*found, *heights)]
 
     case = build(tmp_path, "corner", COUNT // 2)

@@ -7,53 +7,53 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer, VoxelAllocator
-from solidcloud.server.residency.cache_stats import CacheStats, ChangeLog
-from solidcloud.server.residency.eviction import EvictionPolicy
+from solidcloud.server.residency.voxel_cache import EvictionPolicy
 
 
 class Filled:
     """A room whose runs are filled with their row numbers, as a load would."""
 
     def __init__(self, sizes: list[int], budget: int) -> None:
-        self.buffer = ArenaBuffer(budget * ALIGNMENT)
-        self.where = np.full((len(sizes), 3), -1, np.int64)
-        bytes_of, self.stats = [s * ALIGNMENT for s in sizes], CacheStats([s * ALIGNMENT for s in sizes])
-        self.log, self.pins = ChangeLog(), set[int]()
-        self.stats.logs = (self.log,)
+        self.gone, self.pins = list[int](), set[int]()  # gone: rows evicted so far, in order
+        self.policy = EvictionPolicy(budget * ALIGNMENT)
         self.room = VoxelAllocator(
-            self.buffer,
-            bytes_of,
-            self.where,
-            EvictionPolicy(budget * ALIGNMENT),
-            self.stats,
+            budget * ALIGNMENT,
+            [size * ALIGNMENT for size in sizes],
+            self.policy.victims,
+            self._evicted,
             self.pins,
             set(),
         )
 
-    @property
-    def gone(self) -> list[int]:
-        """Return the rows evicted so far, in order."""
-        return list(self.log.changes)
+    def _evicted(self, row: int) -> None:
+        self.gone.append(row)
+        self.policy.removed(row)
+
+    def forget(self, row: int) -> None:
+        """Release a row, as after a failed load."""
+        self.room.forget(row)
+        self.policy.removed(row)
 
     def make(self, row: int, stays: frozenset[int] = frozenset(), most: int | None = None) -> bool:
         """Make room for a row that is not there; `stays` neither go nor move."""
         room = self.room
         self.pins.clear()
         self.pins.update(stays)
-        if not room.allocate(row, lambda _: False, scan=False, most=most):
+        if not room.allocate(row, lambda _: False, most):
             return False
+        self.policy.added(row, room.sizes[row], scan=False)
         offset = room.offsets[row]
-        self.where[row] = (offset // 4, offset // 4 + 1, offset // 2 + 3)
-        self.buffer.arena.ints[offset // 4 : (offset + room.sizes[row]) // 4] = row
+        self.room.where[row] = (offset // 4, offset // 4 + 1, offset // 2 + 3)
+        self.room.buffer.arena.ints[offset // 4 : (offset + room.sizes[row]) // 4] = row
         return True
 
     def check(self) -> None:
         """Every run is whole, and `where` says where."""
         self.room.check()
         for row, offset in self.room.offsets.items():
-            run = self.buffer.arena.ints[offset // 4 : (offset + self.room.sizes[row]) // 4]
+            run = self.room.buffer.arena.ints[offset // 4 : (offset + self.room.sizes[row]) // 4]
             assert (run == row).all()
-            assert self.where[row].tolist() == [offset // 4, offset // 4 + 1, offset // 2 + 3]
+            assert self.room.where[row].tolist() == [offset // 4, offset // 4 + 1, offset // 2 + 3]
 
 
 @pytest.mark.parametrize("budget", [0, 1, 63])
@@ -68,11 +68,11 @@ def test_a_voxel_gets_the_shortest_gap_that_suffices() -> None:
     filled = Filled([1, 2, 1, 2, 1, 1, 3], 8)
     assert all(filled.make(row) for row in range(5))
     assert list(filled.room.offsets.values()) == [0, 64, 192, 256, 384]
-    filled.room.forget(1)
+    filled.forget(1)
     assert filled.make(5) and filled.room.offsets[5] == 448, "one line is free there, two at 64"
-    filled.room.forget(2)
+    filled.forget(2)
     assert filled.make(6) and filled.room.offsets[6] == 64, "the gaps on both sides are joined"
-    assert filled.stats.moved_bytes == 0 and filled.gone == []
+    assert filled.room.moved_bytes == 0 and filled.gone == []
     filled.check()
 
 
@@ -84,7 +84,7 @@ def test_random_use_against_a_model(rng: np.random.Generator) -> None:
         held = list(filled.room.offsets)
         if held and rng.random() < 0.5:
             gone = held[rng.integers(len(held))]
-            filled.room.forget(gone)
+            filled.forget(gone)
             owners[owners == gone] = -1
             continue
         free = "".join("." if owner < 0 else "x" for owner in owners)
@@ -101,10 +101,10 @@ def test_room_in_pieces_is_joined_by_moving() -> None:
     filled = Filled([1] * 6 + [2], 6)
     assert all(filled.make(row) for row in range(6))
     for row in (1, 4):
-        filled.room.forget(row)
+        filled.forget(row)
     assert filled.make(6) and filled.gone == []
     # Between the two holes stood 2 and 3; one stretch of those two had to be moved, by one block.
-    assert filled.stats.moved_bytes == 2 * ALIGNMENT
+    assert filled.room.moved_bytes == 2 * ALIGNMENT
     filled.check()
 
 
@@ -112,7 +112,7 @@ def test_what_stays_is_not_moved_and_others_go_instead() -> None:
     filled = Filled([1] * 6 + [2], 6)
     assert all(filled.make(row) for row in range(6))
     for row in (1, 4):
-        filled.room.forget(row)
+        filled.forget(row)
     before = dict(filled.room.offsets)
     assert filled.make(6, stays=frozenset({2, 3}))
     assert filled.gone == [0]
@@ -125,7 +125,7 @@ def test_nothing_goes_where_all_that_may_is_too_little() -> None:
     assert all(filled.make(row) for row in range(3))
     assert not filled.make(3, stays=frozenset({2}))
     assert not filled.make(3, most=2)
-    assert filled.gone == [] and filled.stats.evicted == 0
+    assert filled.gone == []
     assert filled.make(3) and filled.gone == [0, 1, 2]
     filled.check()
 
@@ -142,7 +142,7 @@ def test_whatever_comes_and_goes_stays_whole(sizes: list[int], steps: list[tuple
     for row, stays in steps:
         row %= len(sizes)
         if row in filled.room.offsets:
-            filled.room.forget(row)
+            filled.forget(row)
             continue
         held = {other: filled.room.offsets[other] for other in stays if other in filled.room.offsets}
         made = filled.make(row, stays=frozenset(stays))

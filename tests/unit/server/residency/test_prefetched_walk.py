@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.residency.eviction import POLICIES
+from solidcloud.server.residency.voxel_cache import POLICIES
 from solidcloud.server.scene import Scene
 
 SCAN = synthetic_scans.make_scan("noise", 9, 30_000)

@@ -1,8 +1,12 @@
-"""Test the voxel cache: one load a voxel, all waiting requests answered, pins and budget respected."""
+"""Test the voxel cache: one load a voxel, all waiting requests answered, pins and budget respected.
+
+The policy is tested against a naive model of lists, in random runs of demands, prefetches, scans and faults.
+"""
 
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 
 import archive_cases
@@ -16,14 +20,14 @@ from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
 from solidcloud.server.kernels.core.scene_arrays import Arena
-from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.voxel_cache import HeldVoxels, VoxelCache
+from solidcloud.server.residency.voxel_cache import POLICIES, EvictionPolicy, HeldVoxels, VoxelCache
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 DEADLINE = 20.0  # [s], for what takes microseconds when it is right
+POLICY_BUDGET = 1000
 
 
 def take(residency: VoxelCache, rows: list[int]) -> HeldVoxels:
@@ -52,7 +56,7 @@ def test_the_least_recently_used_goes_first() -> None:
     for row in (0, 1, 2, 0, 3):
         take(residency, [row])
     assert resident(residency) == [0, 2, 3]
-    assert (residency.stats.hits, residency.stats.misses, residency.evictions) == (1, 4, 1)
+    assert (residency.stats.hits, residency.stats.misses, residency.stats.evicted) == (1, 4, 1)
     assert take(residency, [2, 4]) == HeldVoxels(1, 1, ())
     assert resident(residency) == [2, 3, 4] and store.loads == {0: 1, 1: 1, 2: 1, 3: 1, 4: 1}
     assert residency.resident_bytes == 3 * BLOCK
@@ -234,7 +238,7 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
             verdicts = list(pool.map(ask, range(len(parts))))
         scene.residency.check()
         stats = scene.stats()
-        assert scene.residency.evictions > 0 and not any(over) and sum(unknown) > 0
+        assert scene.residency.stats.evicted > 0 and not any(over) and sum(unknown) > 0
         assert stats.requests == len(parts) and stats.unknown == sum(unknown)
         assert sum(user.requests for user in stats.users) == stats.requests
         assert sum(user.misses for user in stats.users) <= stats.misses
@@ -262,3 +266,95 @@ def test_a_disk_that_is_stuck_keeps_no_other_request_waiting(monkeypatch: pytest
         go.set()
         assert first.result(DEADLINE).misses == 1
     residency.check()
+
+
+class NaiveLru:
+    """Least recently used first, all in lists; what only scans wanted first while it holds over a tenth."""
+
+    def __init__(self) -> None:
+        self.order: list[int] = []
+        self.scans: list[int] = []
+        self.size: dict[int, int] = {}
+
+    def added(self, row: int, size: int, scan: bool) -> None:
+        self.order.append(row)
+        self.size[row] = size
+        if scan:
+            self.scans.append(row)
+
+    def used(self, row: int, scan: bool) -> None:
+        self.order.remove(row)
+        self.order.append(row)
+        if row in self.scans:
+            self.scans.remove(row)
+            if scan:
+                self.scans.append(row)
+
+    def removed(self, row: int) -> None:
+        self.order.remove(row)
+        if row in self.scans:
+            self.scans.remove(row)
+
+    def next_after(self, named: list[int]) -> int | None:
+        """Who goes next when those named have gone."""
+        scans = [row for row in self.scans if row not in named]
+        if sum(self.size[row] for row in scans) > POLICY_BUDGET // 10:
+            return scans[0]
+        return next((row for row in self.order if row not in named), None)
+
+
+def named(policy: EvictionPolicy, naive: NaiveLru, most: int) -> list[int]:
+    """The first victims of a policy, which are the naive one's."""
+    found = list(islice(policy.victims(), most))
+    expected: list[int] = []
+    while len(expected) < most and (row := naive.next_after(expected)) is not None:
+        expected.append(row)
+    assert found == expected
+    return found
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_policy_does_as_its_model(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    policy, naive = EvictionPolicy(POLICY_BUDGET), NaiveLru()
+    resident: dict[int, int] = {}
+    evictions = scans = 0
+    for _ in range(400):
+        row, scan = int(rng.integers(60)), bool(rng.random() < 0.3)
+        if row in resident:
+            policy.used(row, scan=scan)
+            naive.used(row, scan)
+        else:
+            size = int(rng.integers(1, 150))
+            while sum(resident.values()) + size > POLICY_BUDGET:
+                # The first few are in use, now and then.
+                skipped = int(rng.integers(3)) if rng.random() < 0.2 else 0
+                victims = named(policy, naive, skipped + 1)
+                policy.removed(victims[-1])
+                naive.removed(victims[-1])
+                del resident[victims[-1]]
+                evictions += 1
+            resident[row] = size
+            policy.added(row, size, scan=scan)
+            naive.added(row, size, scan)
+            scans += scan
+            if rng.random() < 0.1:  # the record was corrupt
+                policy.removed(row)
+                naive.removed(row)
+                del resident[row]
+        if rng.random() < 0.1:
+            assert sorted(named(policy, naive, 100)) == sorted(resident)
+    assert evictions > 20 and scans > 20
+
+
+def test_nothing_resident_has_no_victims() -> None:
+    policy = EvictionPolicy(POLICY_BUDGET)
+    assert list(policy.victims()) == []
+    policy.added(3, 10, scan=False)
+    policy.removed(3)
+    assert list(policy.victims()) == []
+
+
+def test_an_unknown_policy_is_refused() -> None:
+    with pytest.raises(BadRequestError, match="policy 'mru': expected one of lru, lru\\+prefetch"):
+        EvictionPolicy(POLICY_BUDGET, "mru")

@@ -7,7 +7,7 @@ import pytest
 from small_builds import build
 from solidcloud.schemas.scene.scene_file import read_scene
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.avatars.avatar_file import read_avatar
+from solidcloud.server.avatars.avatar_shape import read_avatar
 from solidcloud.server.cli.main import run
 from solidcloud.server.scene import Scene
 
@@ -70,7 +70,7 @@ def test_the_proposed_place_is_clear_and_a_little_lower_it_is_not(tmp_path: Path
     at = propose(tmp_path, [FLOOR, *WALLS], "--avatar", str(body))
     assert at is not None
     with Scene.open(tmp_path / "hall") as scene:
-        scene.add_avatar("robot", read_avatar(body))
+        scene.add_avatar("robot", read_avatar(body).points)
         poses = np.tile(np.eye(4), (2, 1, 1))
         poses[:, :3, 3] = at + ORIGIN
         poses[1, 2, 3] -= 0.04

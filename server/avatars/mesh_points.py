@@ -1,6 +1,8 @@
-"""Points that fill closed meshes: with those of the surface, the avatar's spheres leave no hole.
+"""Points that cover the surface of a mesh, and those that fill closed meshes: the spheres leave no hole.
 
-The points are a body-centred cubic lattice of covering radius `_COVER` times the radius r of a
+The surface: see `cover_surface`.
+
+The inside: the points are a body-centred cubic lattice of covering radius `_COVER` times the radius r of a
 sphere: no place is farther than that from the nearest node. Nodes inside the mesh become points. A
 place p inside whose nearest node q is inside is therefore covered. If q is outside, the segment
 from q to p crosses a triangle T. Let x be the place on T nearest to q. T is convex and lies behind
@@ -21,12 +23,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import TooLargeError
+from ...schemas.archive.units import MAX_COORDINATE
+from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.request_limits import MAX_AVATAR_POINTS
 
 _Floats = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
+# Longest edge of a triangle whose corners cover it, in radii. No point of a triangle is farther from
+# the nearest corner than the longest edge / sqrt(3), which an equilateral triangle attains. The rest
+# up to sqrt(3) = 1.7321 covers the rounding of the corners.
+_LONGEST_EDGE = 1.732
+# Default radius of a mesh: the square root of its area, divided by this. The avatar then has some
+# 10,000 to 30,000 points, whatever its size. It is 14 mm for a person.
+_RADII = 100.0
+# Step to which the default radius is rounded, as in `make_avatar` [m].
+_STEP = 2.0**-20
+# Largest default radius [m], that of an avatar in a scene file.
+_MAX_RADIUS = 8.0
+# Triangles held at most, 72 bytes each. A closed surface has half as many points as triangles.
+_MAX_TRIANGLES = 3 * MAX_AVATAR_POINTS
 # Covering radius of the lattice, in radii of a sphere. A smaller one takes more nodes; a larger one
 # leaves less slack for the triangles near a node to share one point.
 _COVER = 0.95
@@ -36,6 +52,99 @@ _COVER_OF_HALF = math.sqrt(5) / 2
 _STEPS = 1 << 24
 # Pairs of a triangle and a column or node that are examined at a time.
 _PAIRS = 1 << 20
+
+
+class SurfaceCover(NamedTuple):
+    """Cover of a surface.
+
+    points: (n, 3) [m].  radius: used [m]; None if none was given and the surface has no area.
+    triangles: (k, 3, 3), of the surface, after halving [m].
+    """
+
+    points: _Floats
+    radius: float | None
+    triangles: _Floats
+
+
+def cover_surface(triangles: _Floats, radius: float | None, what: str) -> SurfaceCover:
+    """Cover a surface with points: no part of it is farther than a radius from one.
+
+    triangles: (m, 3, 3), the corners of each [m].  what: name of the mesh, for messages.
+    radius: above 0 [m]; None: a hundredth of the square root of the area.
+    Triangles with an edge longer than sqrt(3) radii are halved at their longest edge until none is
+    left. The points are the corners of all triangles, each once, sorted: they depend neither on a
+    random number nor on the order of vertices.
+    Raise BadRequestError for a corner that is not finite or too far away, or a radius that is too
+    small or too large, TooLargeError for more than MAX_AVATAR_POINTS points.
+    """
+    if not np.isfinite(triangles).all() or np.abs(triangles).max() > MAX_COORDINATE:
+        raise BadRequestError(
+            f"{what}: a vertex that is not finite or beyond {MAX_COORDINATE:g} m: expected finite coordinates [m]"
+        )
+    area = _area(triangles)
+    if radius is None:
+        if area == 0.0:
+            return SurfaceCover(_distinct(triangles.reshape(-1, 3)), None, triangles)
+        radius = max(1, round(math.sqrt(area) / _RADII / _STEP)) * _STEP
+        if radius > _MAX_RADIUS:
+            raise BadRequestError(
+                f"{what}: a surface of {area:.3g} m², for which spheres of {radius:.3g} m would be used: expected "
+                f"metres, and at most {_MAX_RADIUS:g} m: give the unit of its file, scale the mesh, or give a radius"
+            )
+    if not 0 < radius < math.inf:
+        raise BadRequestError(
+            f"{what}: radius {radius:g} m: expected a positive length, with which spheres cover the surface: give "
+            "one, or add the vertices of the mesh instead"
+        )
+    longest = _LONGEST_EDGE * radius
+    # An equilateral triangle has the largest area for its longest edge.
+    if len(triangles) > _MAX_TRIANGLES or area > _MAX_TRIANGLES * math.sqrt(3) / 4 * longest**2:
+        raise _surface_too_large(what, area, radius)
+    corners, small = [triangles.reshape(-1, 3)], []
+    count = 0
+    while len(triangles):
+        # Of equally long edges, that of the least corners is halved, whatever the order of the corners.
+        order = np.lexsort(triangles.transpose(2, 0, 1)[::-1], axis=-1)
+        triangles = np.take_along_axis(triangles, order[:, :, None], axis=1)
+        edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
+        begin = edges.argmax(axis=1)
+        long = edges.max(axis=1) > longest
+        count += len(triangles) - int(long.sum())
+        small.append(triangles[~long])
+        triangles, begin = triangles[long], begin[long]
+        rows = np.arange(len(triangles))
+        first, second = triangles[rows, begin], triangles[rows, (begin + 1) % 3]
+        third = triangles[rows, (begin + 2) % 3]
+        # Triangles that share an edge compute the same bits: the sum does not depend on the order.
+        middle = (first + second) / 2
+        corners.append(middle)
+        halves = (first, middle, third), (middle, second, third)
+        triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
+        if count + len(triangles) > _MAX_TRIANGLES:
+            raise _surface_too_large(what, area, radius)
+    points = _distinct(np.concatenate(corners))
+    if len(points) > MAX_AVATAR_POINTS:
+        raise _surface_too_large(what, area, radius)
+    return SurfaceCover(points, radius, np.concatenate(small))
+
+
+def _area(triangles: _Floats) -> float:
+    """Return the area of all triangles [m²]. The order of the triangles does not change it."""
+    sides = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return math.fsum((np.linalg.norm(sides, axis=1) / 2).tolist())
+
+
+def _distinct(points: _Floats) -> _Floats:
+    """Return the distinct points (n, 3), sorted by x, then y, then z."""
+    _, first = np.unique(_numbered(points), return_index=True)
+    return np.asarray(points[first] + 0.0)  # no -0.0
+
+
+def _surface_too_large(what: str, area: float, radius: float) -> TooLargeError:
+    return TooLargeError(
+        f"{what}: a surface of {area:.3g} m² takes more than {MAX_AVATAR_POINTS} points at a radius of {radius:g} m: "
+        "expected at most that many: give a larger radius, or simplify the mesh"
+    )
 
 
 class ClosedParts(NamedTuple):
@@ -140,18 +249,18 @@ def fill_inside(found: ClosedParts, small: _Floats, surface: _Floats, radius: fl
     half = math.floor(_COVER * radius / _COVER_OF_HALF / found.step) * 2
     volume = abs(float(_volumes(found.corners)[~found.hole[found.part]].sum()))
     if half < 2 or not 0 <= volume / max(4 * half**3, 1) <= 2 * MAX_AVATAR_POINTS:
-        raise _too_large(what, radius)
+        raise _inside_too_large(what, radius)
     lattice = _Lattice(found, half)
     inside = _nodes_inside(found, lattice)
     if inside is None or len(inside) > room:
-        raise _too_large(what, radius)
+        raise _inside_too_large(what, radius)
     feet = _feet(lattice, small, inside, radius)
     points = np.concatenate([lattice.places(inside), feet]) + 0.0
     number = _numbered(np.concatenate([surface, points]))
     _, first = np.unique(number, return_index=True)
     points = points[first[first >= len(surface)] - len(surface)]
     if len(points) > room:
-        raise _too_large(what, radius)
+        raise _inside_too_large(what, radius)
     return points
 
 
@@ -193,15 +302,15 @@ def _nodes_inside(found: ClosedParts, lattice: _Lattice) -> _Integers | None:
     order = np.lexsort((height, column, part))
     column, part, height, way = column[order], part[order], height[order], way[order]
     # The crossings of a column and a part cancel out, so that the sum begins with 0 in each.
-    within = np.flatnonzero(np.cumsum(way)[:-1] != 0) if len(way) else np.empty(0, np.int64)
+    within = np.flatnonzero(np.cumsum(way)[:-1] != 0)
     odd = column // lattice.counts[1] & 1
     # A node belongs to the interval that begins below it and ends at or above it.
     above = np.floor((height - odd) / 2).astype(np.int64)
     lengths = above[within + 1] - above[within]
     if lengths.sum() > 4 * MAX_AVATAR_POINTS:
         return None
-    which, at = _expand(lengths)
-    row = within[which]
+    row = np.repeat(within, lengths)
+    at = np.arange(len(row)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     k = 2 * (above[row] + 1 + at) + odd[row]
     numbers, parts = column[row] * lattice.counts[2] + k, part[row]
     holes = found.hole[parts]
@@ -224,13 +333,9 @@ def _crossings(
     low, high = found.corners[:, :, :2].min(axis=1), found.corners[:, :, :2].max(axis=1)
     origin = lattice.first[:2] + odd * lattice.half
     period = 2 * lattice.half
-    begin, count = -((origin - low) // period), 0
-    count = np.maximum((high - origin) // period - begin + 1, 0)
+    begin, end = -((origin - low) // period), (high - origin) // period
     parts: list[tuple[_Integers, ...]] = []
-    for rows in _slices(count.prod(axis=1)):
-        which, at = _expand(count[rows].prod(axis=1))
-        which += rows.start
-        column = begin[which] + np.stack(np.divmod(at, count[which, 1]), axis=1)
+    for which, column in _nodes_of(begin, end):
         place = origin + column * period
         corner = found.corners[which]
         left, areas = [], []
@@ -256,8 +361,6 @@ def _crossings(
                 np.where(left[0][met], 1, -1),
             )
         )
-    if not parts:
-        return (np.empty(0, np.int64),) * 2 + (np.empty(0), np.empty(0, np.int64))
     return tuple(np.concatenate(each) for each in zip(*parts, strict=True))  # type: ignore[return-value]
 
 
@@ -273,12 +376,7 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
     found: list[tuple[NDArray[np.generic], ...]] = []
     for odd in (0, 1):
         begin = np.ceil((low - odd) / 2).astype(np.int64)
-        count = np.maximum(np.floor((high - odd) / 2).astype(np.int64) - begin + 1, 0)
-        for rows in _slices(count.prod(axis=1)):
-            which, at = _expand(count[rows].prod(axis=1))
-            which += rows.start
-            rest, k = np.divmod(at, count[which, 2])
-            index = begin[which] + np.stack([*np.divmod(rest, count[which, 1]), k], axis=1)
+        for which, index in _nodes_of(begin, np.floor((high - odd) / 2).astype(np.int64)):
             number = lattice.numbers(*(2 * index + odd).T)
             at_or_after = np.minimum(np.searchsorted(inside, number), max(len(inside) - 1, 0))
             outside = inside[at_or_after] != number if len(inside) else np.ones(len(number), bool)
@@ -287,12 +385,10 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
             square = ((foot - lattice.places(number)) ** 2).sum(axis=1)
             near = square <= reach * reach
             found.append((number[near], which[near], foot[near], square[near]))
-    if not found:
-        return np.empty((0, 3))
     number, which, foot, square = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.lexsort((*foot.T, square, number))
     number, which, foot, square = number[order], which[order], foot[order], square[order]
-    chosen = []
+    chosen = [np.empty((0, 3))]
     while len(number):
         begins = np.r_[True, number[1:] != number[:-1]]
         chosen.append(foot[begins])
@@ -303,7 +399,7 @@ def _feet(lattice: _Lattice, small: _Floats, inside: _Integers, radius: float) -
         covered = (height <= apart) & (2 * height <= radius * radius - reach * reach + apart)
         covered |= begins
         number, which, foot, square = (each[~covered] for each in (number, which, foot, square))
-    return np.concatenate(chosen) if chosen else np.empty((0, 3))
+    return np.concatenate(chosen)
 
 
 def _nearest_on(triangles: _Floats, places: _Floats) -> _Floats:
@@ -370,24 +466,28 @@ def _volumes(corners: _Integers) -> _Floats:
     return found
 
 
-def _expand(counts: _Integers) -> tuple[_Integers, _Integers]:
-    """Return for each of counts.sum() items the row it belongs to, and its number in that row."""
-    rows = np.repeat(np.arange(len(counts)), counts)
-    return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+def _nodes_of(begin: _Integers, end: _Integers) -> Iterator[tuple[_Integers, _Integers]]:
+    """Yield rows (m,) and integers (m, d) from begin to end, inclusive, of each row (n, d).
 
-
-def _slices(counts: _Integers) -> Iterator[slice]:
-    """Divide rows into slices of about _PAIRS items. counts: of the items in each row."""
+    About _PAIRS at a time.
+    """
+    sides = np.maximum(end - begin + 1, 0)
+    counts = sides.prod(axis=1)
     ends = np.cumsum(counts)
-    begin = 0
-    while begin < len(counts):
-        done = ends[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(ends, done + _PAIRS, side="right")))
-        yield slice(begin, end)
-        begin = end
+    first = 0
+    while first < len(counts):
+        before = ends[first] - counts[first]
+        last = max(first + 1, int(np.searchsorted(ends, before + _PAIRS, side="right")))
+        rows = np.repeat(np.arange(first, last), counts[first:last])
+        at = np.arange(before, ends[last - 1]) - (ends - counts)[rows]
+        index = np.empty((len(rows), sides.shape[1]), np.int64)
+        for axis in reversed(range(sides.shape[1])):
+            at, index[:, axis] = np.divmod(at, sides[rows, axis])
+        yield rows, begin[rows] + index
+        first = last
 
 
-def _too_large(what: str, radius: float) -> TooLargeError:
+def _inside_too_large(what: str, radius: float) -> TooLargeError:
     return TooLargeError(
         f"{what}: filled, it takes more than {MAX_AVATAR_POINTS} points at a radius of {radius:g} m: expected at "
         "most that many: give `hollow`, which leaves its inside empty, or a larger radius"

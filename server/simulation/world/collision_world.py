@@ -118,7 +118,7 @@ class World:
             self._held.unknown = True
 
     def avatar(self, name: str) -> AvatarModel:
-        """Return an avatar of the scene file. Raise UnknownAvatarError until they are added."""
+        """Return an avatar of the scene file. Raise UnknownAvatarError."""
         model: AvatarModel = self._scene.avatar(name, EVERYBODY)
         return model
 

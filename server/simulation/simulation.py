@@ -190,14 +190,16 @@ class Simulation:
         A user's first command places its body at the scene's spawn, or without one at the commanded
         pose. The outcome of a refused command is its error; the others are simulated.
         now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
-        first; None: no user is removed.
+        first, but none with a turn: a frame that compiles or loads for longer made it wait. None: no
+        user is removed.
         stop: ends the frame early: users not yet simulated stay, with the outcome ExpiredError.
         logged: of each turn, for a replay. A result with a recorded body is taken without a
         simulation, and a turn that was stopped is stopped again. All others wait for voxels.
         """
         with self._frame:
             if now is not None:
-                self._remove([u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS])
+                silent = {u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS}
+                self._remove(list(silent.difference(turn.user for turn in turns)))
             self._frames += 1
             outcomes = []
             for number, turn in enumerate(turns):
@@ -340,11 +342,9 @@ class Simulation:
     def warm(self) -> None:
         """Simulate some frames, so that no user waits for compilation. Nobody else may use this simulation.
 
-        Their motions lead onto a scan point from above, away from it, past it, and into another
-        user.
+        Their motions lead onto a scan point from above, away from it and past it.
         """
-        place = _find_scan_point(self.world)
-        user, other = User(_WARM, "warm"), User(_WARM, "other")
+        place, user = _find_scan_point(self.world), User(_WARM, "warm")
         self.scene.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
         across = np.roll(self._up, 1)
         far = min(0.5, self.file.limits.longest_move / 4)
@@ -353,12 +353,8 @@ class Simulation:
                 first, last = (translated(np.eye(4), place + far * each) for each in (begin, end))
                 with self._frame, suppress(SolidcloudError):  # such a frame may be impossible here
                     body = _make_body(user, self.scene.avatar("warm", _WARM), first)
-                    if self._bodies is not None:
-                        self._bodies.put_user(_make_body(other, body.avatar, (first + last) / 2))
                     for pose in (last, last, first):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
-        if self._bodies is not None:
-            self._bodies.remove_user(_public_name(other))
         self.scene.forget_client(_WARM)
 
 
@@ -431,12 +427,10 @@ def make_simulation(scene: Any, file: SceneFile) -> Simulation:
 def _find_scan_point(world: "World") -> Vec:
     """Return a scan point of a world, (3,) [m]; the least corner of a voxel's points if none is near it."""
     with world as held:
-        archive, pose = held[0].opened.store.archive, held[0].placed.pose
-        lattice = archive.header.lattice
-        corner = archive.coordinates[0] * lattice.voxel_steps + archive.voxels["low"][0]
-        places = lattice.to_world(corner[None])
-        place: Vec = (places if pose is None else transform_points(pose, places))[0]
-        hit = world.nearest(place, min(16.0, 2 * lattice.voxel_size))
+        arrays, tree, pose = held[0].data.arrays, held[0].data.tree, held[0].placed.pose
+        low, high = (side[0] * arrays.step + arrays.origin for side in (tree.low, tree.high))
+        place: Vec = low if pose is None else transform_points(pose, low[None])[0]
+        hit = world.nearest(place, min(16.0, norm(high - low) + arrays.step))
     return place if hit is None or hit.cloud is None else hit.cloud
 
 

@@ -506,7 +506,8 @@ class BodyObstacle:
 
 def warm_kernels() -> None:
     """Compile the kernels before the first request needs them."""
-    model = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05)
+    corner = [[x, y, 0.0] for x in (0.0, 0.05) for y in (0.0, 0.05)]  # a surface, which has a normal
+    model = make_avatar(corner, 0.05)
     bodies = Bodies(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     poses = [np.eye(4), np.eye(4)]
     poses[1][0, 3] = 1.0

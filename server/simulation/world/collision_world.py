@@ -118,7 +118,7 @@ class World:
             self._held.unknown = True
 
     def avatar(self, name: str) -> AvatarModel:
-        """Return an avatar of the scene file. Raise UnknownAvatarError until they are added."""
+        """Return an avatar of the scene file. Raise UnknownAvatarError."""
         model: AvatarModel = self._scene.avatar(name, EVERYBODY)
         return model
 
@@ -177,23 +177,36 @@ class World:
             held.unknown = True
         return answers, number
 
+    def _ask_avatar(
+        self,
+        engine: Callable[..., _Answers],
+        avatar: AvatarModel,
+        poses: tuple[Pose, ...],
+        arguments: tuple[Any, ...],
+        budget: QueryBudget,
+        *same: str,
+    ) -> tuple[_Answers, int]:
+        """Ask each archive about an avatar at a pose (4, 4), or on the motion between two, as `_ask`.
+
+        engine: of server/queries.  arguments: those between its poses and its budget.
+        """
+
+        def ask(each: HeldArchive) -> _Answers:
+            placed = [each.placed.poses_in(pose[None]) for pose in poses]
+            return engine(each.data, avatar, *placed, *arguments, budget)
+
+        return self._ask(budget, ask, *same)
+
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
         """Return the verdict at a pose (4, 4) over all archives; see server/queries/collide.py."""
-        poses = pose[None]
-        answers, _ = self._ask(
-            budget, lambda each: collide_fast(each.data, avatar, each.placed.poses_in(poses), 0.0, budget)
-        )
+        answers, _ = self._ask_avatar(collide_fast, avatar, (pose,), (0.0,), budget)
         return _VERDICTS[answers.verdict.item(0)]
 
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
     ) -> DistanceAnswers:
         """Return the distance of the avatar from the scan at a pose; see server/queries/distance.py."""
-        poses = pose[None]
-        answers, _ = self._ask(
-            budget, lambda each: distance_fast(each.data, avatar, each.placed.poses_in(poses), reach, budget)
-        )
-        return answers
+        return self._ask_avatar(distance_fast, avatar, (pose,), (reach,), budget)[0]
 
     def contacts(
         self,
@@ -208,14 +221,9 @@ class World:
 
         limit: of each archive.
         """
-        poses, how = pose[None], (limit, margin, cluster_distance, budget)
-        return self._ask(
-            budget,
-            lambda each: contacts(each.data, avatar, each.placed.poses_in(poses), *how),
-            "signed_distance",
-            "cloud_point",
-            "avatar_point",
-        )
+        arguments = limit, margin, cluster_distance
+        names = "signed_distance", "cloud_point", "avatar_point"
+        return self._ask_avatar(contacts, avatar, (pose,), arguments, budget, *names)
 
     def deepest(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Hit | None:
         """Return the deepest contact at a pose, with fraction 0, or None."""
@@ -249,21 +257,9 @@ class World:
 
         See server/queries/sweep.py. Nothing is touched before the hit's fraction.
         """
-        first, last = pose_from[None], pose_to[None]
-        found, number = self._ask(
-            budget,
-            lambda each: sweep_fast(
-                each.data,
-                avatar,
-                each.placed.poses_in(first),
-                each.placed.poses_in(last),
-                0.0,
-                tolerance,
-                budget,
-            ),
-            "upper",
-            "witness_cloud",
-            "witness_avatar",
+        names = "upper", "witness_cloud", "witness_avatar"
+        found, number = self._ask_avatar(
+            sweep_fast, avatar, (pose_from, pose_to), (0.0, tolerance), budget, *names
         )
         verdict, exact = _VERDICTS[found.verdict.item(0)], found.exact.item(0)
         if not exact:
@@ -320,16 +316,20 @@ class World:
         return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
     def highest(
-        self, hit: Hit, directions: NDArray[np.float64], reach: float, budget: QueryBudget = EXACT
+        self,
+        archive: int,
+        cloud: Vec,
+        directions: NDArray[np.float64],
+        reach: float,
+        budget: QueryBudget = EXACT,
     ) -> NDArray[np.float64]:
-        """Return how high the scan points around a touched one lie along directions (k,) [m].
+        """Return how high the scan points around one (3,) of an archive lie along directions (k,) [m].
 
-        hit: of the scan.  directions: (k, 3) unit.  reach, budget: as for `normal`. Return 0 if
-        a voxel within reach is not in memory, or cannot be read.
+        directions: (k, 3) unit.  reach, budget: as for `normal`. Return 0 if a voxel within reach is
+        not in memory, or cannot be read.
         """
-        assert hit.cloud is not None
         found = self._ask_surface(
-            hit.archive, hit.cloud, directions, budget,
+            archive, cloud, directions, budget,
             lambda normals, place, ways, **how: normals.highest(place, ways, reach, **how),
         )  # fmt: skip
         return np.zeros(len(directions)) if found is None else found

@@ -229,9 +229,8 @@ class WalkCall:
             if normal is not None:
                 tape.normal[row] = normal
         elif query == state.HIGHEST:
-            touched = Hit(0.0, Verdict.CONTACT, None, place, archive=archive)
             directions = question.directions[0, : question.count.item()].copy()
-            heights = world.highest(touched, directions, self._walker.reaches[level], frame.budget)
+            heights = world.highest(archive, place, directions, self._walker.reaches[level], frame.budget)
             tape.heights[row] = 0.0
             tape.heights[row, : len(heights)] = heights
         elif query == state.NEAREST:

@@ -31,7 +31,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the archive of a room, in many voxels."""
     folder = tmp_path_factory.mktemp("room")
     archive = effect_rooms.build(folder, effect_rooms.room(SIZE), voxel=1.0).archive
-    # A user that waits for compilers is silent for too long, and enters anew at its next command.
+    # Compile before the tests, whose waits have limits.
     with (
         opened(archive, folder, WALKING) as scene,
         blocked_loads(scene),

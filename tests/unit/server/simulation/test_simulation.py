@@ -152,6 +152,14 @@ def test_who_wishes_nothing_for_long_has_left(floor):
     assert floor.users == [BO], "half a second short of it"
 
 
+def test_a_frame_that_takes_long_removes_no_user_whose_command_waited(floor):
+    floor.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))], now=100.0)
+    turns = [FrameCommand(AL, wish(2, velocity=(0.0, 0.0, 0.0)))]
+    (moved,) = floor.step(turns, now=101.0 + SILENT_SECONDS)
+    assert np.array_equal(moved.state.pose, pose_at(0.5)), "goes on where it was, not at the spawn"
+    assert floor.users == [AL]
+
+
 def test_a_move_is_remembered_by_nobody(floor):
     floor.step([FrameCommand(AL, wish(1, 0.5))])
     moved = floor.move("al", pose_at(0.0), pose_at(-1.0), 0.25, client="a")

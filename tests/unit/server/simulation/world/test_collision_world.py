@@ -176,7 +176,8 @@ def test_a_normal_with_points_in_a_voxel_that_is_not_in_memory_is_unknown(tmp_pa
             assert (
                 world.normal(hit, 0.08, QueryBudget(late=late)) is None and late.count > 0 and world.unknown
             )
-            assert not world.highest(hit, out[None], 0.08, QueryBudget(late=late)).any() and world.unknown
+            assert not world.highest(hit.archive, hit.cloud, out[None], 0.08, QueryBudget(late=late)).any()
+            assert world.unknown
             gate.set()
             world.begin(NO_STOP)
             assert world.normal(hit, 0.08) == pytest.approx(out) and not world.unknown

@@ -275,11 +275,9 @@ def _surely_near(words, ints, halves, block_words, location, row, x, y, z, lanes
 def _flat_touches(scene, location, row, x, y, z, block, threshold, scratch):
     """Return EARLY if a point of a block is surely within the tolerance of one below a flat node.
 
-    Return SKIP if none is, nor within the reach.
+    Return SKIP if no point is near the node, within the reach or within the tolerance.
     """
     words, descent, early = scene.words, scratch.descent, scratch.early
-    if not early[1] > np.float32(0.0):
-        return GO_ON
     # Points beyond the wider reach are also beyond the exact one: most blocks need this test alone.
     # The largest sphere may reach farther than the smallest one with the tolerance.
     wide, lanes, keep = max(threshold, early[0]), descent.placed.lanes, descent.keep
@@ -296,9 +294,10 @@ def _flat_touches(scene, location, row, x, y, z, block, threshold, scratch):
 @njit_no_refcount
 def _collide_voxel(avatar, m, extent, pose, scene, voxel, location, front, count, scratch):
     """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets."""
+    by_class = scratch.by_class
     found, _ = descend_voxel(
-        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, scratch.by_class.threshold,
-        scratch.by_class.mask, True, _flat_touches, _leaves_touch, _below_touches,
+        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, by_class.threshold, by_class.mask,
+        True, scratch.early[1] > np.float32(0.0), _flat_touches, _leaves_touch, _below_touches,
     )  # fmt: skip
     return found
 

@@ -63,8 +63,8 @@ def make_descent(avatar):
 
 @nb.njit(nogil=True, inline="always")
 def descend_voxel(
-    avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, mask, first_hit, on_flat, on_leaves,
-    on_below,
+    avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, mask, first_hit, tolerant,
+    on_flat, on_leaves, on_below,
 ):  # fmt: skip
     """Search one resident voxel with the placed avatar's front, the first `count` entries of `front`.
 
@@ -73,6 +73,7 @@ def descend_voxel(
     apart are pruned.  mask: the number of classes minus one, uint64.
     first_hit: whether the first pair found ends the search, a constant. Then the cut never changes, and
     of the children to descend into, the one of least power distance to the avatar's root comes first.
+    tolerant: whether `on_flat` is called.
     on_flat(scene, location, row, x, y, z, block, threshold, scratch): called for a flat inner node and
     an avatar's leaf node, whose centre is x, y, z from the frame.
     on_leaves(avatar, m, a, scene, voxel, location, row, scratch): for leaf nodes of both, the latter's
@@ -120,7 +121,6 @@ def descend_voxel(
                 for i in range(at, at + count):
                     a = front_first + np.int64(which[U(i)])
                     a_first = np.int64(firsts[U(a)])
-                    found = GO_ON
                     if not first_hit:
                         threshold = cut[c]  # pairs found have lowered it
                     if a_first < 0:
@@ -129,7 +129,7 @@ def descend_voxel(
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if first >= 0:
+                        if tolerant and first >= 0:
                             u = U(i)
                             x_a, y_a, z_a = bounds[0, u], bounds[1, u], bounds[2, u]
                             found = on_flat(scene, location, row, x_a, y_a, z_a, block, threshold, scratch)
@@ -141,12 +141,16 @@ def descend_voxel(
                             continue
                         if first < 0:
                             found = on_leaves(avatar, m, a, scene, voxel, location, row, scratch)
+                            if found != GO_ON:
+                                return found, 0
+                            if stopped(stop):  # the blocks of a whole front may take milliseconds
+                                return GO_ON, depth + 1
+                            continue
                     elif first < 0:
                         found = on_below(avatar, m, extent, pose, scene, voxel, location, a, row, scratch)
-                    if first < 0:
                         if found != GO_ON:
                             return found, 0
-                        if stopped(stop):  # the blocks of a whole front may take milliseconds
+                        if stopped(stop):
                             return GO_ON, depth + 1
                         continue
                     copy_node(bounds, which, U(i), U(left))

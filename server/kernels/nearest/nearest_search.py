@@ -159,8 +159,8 @@ def _nearest_voxel(avatar, m, extent, pose, scene, voxel, front, count, scratch)
     if not nodes_meet(words, location.rows, x, y, z, nodes[3, 0], threshold):
         return np.inf
     _, entries = descend_voxel(
-        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, best.mask, False, _pass_flat,
-        _search_leaves, _search_below,
+        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, best.mask, False, False,
+        _pass_flat, _search_leaves, _search_below,
     )  # fmt: skip
     settle_candidates(best, avatar.points, m, placed.shift, scene.ints, scene.halves, placed.lanes)
     return _least_left(words, front.bounds, descent.stack, entries, off, best.frame[4])

@@ -58,6 +58,7 @@ from ..core.node_bounds import (
     set_class_thresholds,
 )
 from ..core.placed_avatar import (
+    make_front,
     node_reach,
     pair_in_reach,
     place_block_once,
@@ -271,34 +272,32 @@ def _surely_near(words, ints, halves, block_words, location, row, x, y, z, lanes
 
 
 @njit_inlined
-def _flat_touches(scene, location, row, at, block, threshold, scratch):
+def _flat_touches(scene, location, row, x, y, z, block, threshold, scratch):
     """Return EARLY if a point of a block is surely within the tolerance of one below a flat node.
 
-    Return SKIP if none is, nor within the reach.
+    Return SKIP if no point is near the node, within the reach or within the tolerance.
     """
     words, descent, early = scene.words, scratch.descent, scratch.early
-    if not early[1] > np.float32(0.0):
-        return GO_ON
     # Points beyond the wider reach are also beyond the exact one: most blocks need this test alone.
     # The largest sphere may reach farther than the smallest one with the tolerance.
     wide, lanes, keep = max(threshold, early[0]), descent.placed.lanes, descent.keep
     if not lanes_meet(words, row, lanes, block, location.x, location.y, location.z, wide, keep):
         return SKIP
-    bounds, u = descent.front.bounds, U(at)
     near, tests = _surely_near(
-        words, scene.ints, scene.halves, scene.block_words, location, row, bounds[0, u], bounds[1, u], bounds[2, u],
-        lanes, block, early, keep, descent.keep8,
+        words, scene.ints, scene.halves, scene.block_words, location, row, x, y, z, lanes, block, early, keep,
+        descent.keep8,
     )  # fmt: skip
     descent.counters[1] += tests
     return EARLY if near else GO_ON
 
 
 @njit_no_refcount
-def _collide_voxel(avatar, m, extent, pose, scene, voxel, location, count, scratch):
+def _collide_voxel(avatar, m, extent, pose, scene, voxel, location, front, count, scratch):
     """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets."""
+    by_class = scratch.by_class
     found, _ = descend_voxel(
-        avatar, m, extent, pose, scene, voxel, location, count, scratch, scratch.by_class.threshold,
-        scratch.by_class.mask, True, _flat_touches, _leaves_touch, _below_touches,
+        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, by_class.threshold, by_class.mask,
+        True, scratch.early[1] > np.float32(0.0), _flat_touches, _leaves_touch, _below_touches,
     )  # fmt: skip
     return found
 
@@ -316,12 +315,16 @@ def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, 
     and a missing voxel overrides CLEAR. Once the scene's stop flag is set, poses are not
     finished.
     """
-    scratch = _make_collide_scratch(avatar, scene.radius_deficit)
-    _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, scratch)
+    front, scratch = make_front(avatar), _make_collide_scratch(avatar, scene.radius_deficit)
+    _collide_poses(
+        poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, front, scratch
+    )
 
 
 @njit_no_refcount
-def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, scratch):
+def _collide_poses(
+    poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, front, scratch
+):
     """Implement `collide_poses` with its scratch passed in."""
     placed, counters, by_class = scratch.descent.placed, scratch.descent.counters, scratch.by_class
     nodes, ints, rows = placed.nodes, scene.ints, reach.lists.rows
@@ -359,8 +362,8 @@ def _collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance,
             threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
             if nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 if count == 0:
-                    count = place_front(avatar, m, placed, scene, extent, scratch.descent.front.bounds)
-                found = _collide_voxel(avatar, m, extent, i, scene, voxel, location, count, scratch)
+                    count = place_front(avatar, m, placed, scene, extent, front.bounds)
+                found = _collide_voxel(avatar, m, extent, i, scene, voxel, location, front, count, scratch)
                 if found != CLEAR:
                     verdict[i], at = found, end
                     break

@@ -27,14 +27,7 @@ from .node_bounds import (
     nodes_meet,
     power_distance,
 )
-from .placed_avatar import (
-    AvatarFront,
-    PlacedAvatar,
-    make_front,
-    make_placed,
-    pad_list,
-    place_lanes,
-)
+from .placed_avatar import PlacedAvatar, make_placed, pad_list, place_lanes
 from .scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, stopped
 
 U = np.uint64  # see placed_avatar.py
@@ -46,14 +39,13 @@ GO_ON, SKIP = 0, -1
 class Descent(NamedTuple):
     """Scratch of one call.
 
-    placed, front: the avatar under the pose in hand.
+    placed: the avatar under the pose in hand.
     stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list, length.
     keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
     counters: (3,) int64, node visits, point tests, one of the search.
     """
 
     placed: PlacedAvatar
-    front: AvatarFront
     stack: NDArray[np.int64]
     keep: NDArray[np.bool_]
     keep8: NDArray[np.uint64]
@@ -65,25 +57,25 @@ def make_descent(avatar):
     """Allocate scratch for one avatar (not empty)."""
     keep = np.zeros(LANES, np.bool_)
     return Descent(
-        make_placed(avatar), make_front(avatar), np.empty((STACK, 3), np.int64), keep, keep.view(np.uint64),
-        np.zeros(3, np.int64),
-    )  # fmt: skip
+        make_placed(avatar), np.empty((STACK, 3), np.int64), keep, keep.view(np.uint64), np.zeros(3, np.int64)
+    )
 
 
 @nb.njit(nogil=True, inline="always")
 def descend_voxel(
-    avatar, m, extent, pose, scene, voxel, location, count, scratch, cut, mask, first_hit, on_flat, on_leaves,
-    on_below,
+    avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, mask, first_hit, tolerant,
+    on_flat, on_leaves, on_below,
 ):  # fmt: skip
-    """Search one resident voxel with the placed avatar's front, the first `count` entries of its lists.
+    """Search one resident voxel with the placed avatar's front, the first `count` entries of `front`.
 
     m: pose, number `pose` of the request.  extent: of `place_root`.  location: of the voxel.
     scratch: the search's own, with a `descent`.  cut: (n,) float32, by radius class: nodes farther
     apart are pruned.  mask: the number of classes minus one, uint64.
     first_hit: whether the first pair found ends the search, a constant. Then the cut never changes, and
     of the children to descend into, the one of least power distance to the avatar's root comes first.
-    on_flat(scene, location, row, at, block, threshold, scratch): called for a flat inner node and an
-    avatar's leaf node, at entry `at` of the lists.
+    tolerant: whether `on_flat` is called.
+    on_flat(scene, location, row, x, y, z, block, threshold, scratch): called for a flat inner node and
+    an avatar's leaf node, whose centre is x, y, z from the frame.
     on_leaves(avatar, m, a, scene, voxel, location, row, scratch): for leaf nodes of both, the latter's
     points marked.
     on_below(avatar, m, extent, pose, scene, voxel, location, a, row, scratch): for a leaf node of the
@@ -97,7 +89,7 @@ def descend_voxel(
     (11 us a pose instead of 4 with each step in a function).
     """
     words, ints, descent = scene.words, scene.ints, scratch.descent
-    placed, front, stack, counters = descent.placed, descent.front, descent.stack, descent.counters
+    placed, stack, counters = descent.placed, descent.stack, descent.counters
     bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
     listed, listed8, keep = front.keep, front.keep8, descent.keep
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
@@ -129,7 +121,6 @@ def descend_voxel(
                 for i in range(at, at + count):
                     a = front_first + np.int64(which[U(i)])
                     a_first = np.int64(firsts[U(a)])
-                    found = GO_ON
                     if not first_hit:
                         threshold = cut[c]  # pairs found have lowered it
                     if a_first < 0:
@@ -138,8 +129,10 @@ def descend_voxel(
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if first >= 0:
-                            found = on_flat(scene, location, row, i, block, threshold, scratch)
+                        if tolerant and first >= 0:
+                            u = U(i)
+                            x_a, y_a, z_a = bounds[0, u], bounds[1, u], bounds[2, u]
+                            found = on_flat(scene, location, row, x_a, y_a, z_a, block, threshold, scratch)
                             if found == SKIP:
                                 continue
                             if found != GO_ON:
@@ -148,12 +141,16 @@ def descend_voxel(
                             continue
                         if first < 0:
                             found = on_leaves(avatar, m, a, scene, voxel, location, row, scratch)
+                            if found != GO_ON:
+                                return found, 0
+                            if stopped(stop):  # the blocks of a whole front may take milliseconds
+                                return GO_ON, depth + 1
+                            continue
                     elif first < 0:
                         found = on_below(avatar, m, extent, pose, scene, voxel, location, a, row, scratch)
-                    if first < 0:
                         if found != GO_ON:
                             return found, 0
-                        if stopped(stop):  # the blocks of a whole front may take milliseconds
+                        if stopped(stop):
                             return GO_ON, depth + 1
                         continue
                     copy_node(bounds, which, U(i), U(left))

@@ -93,7 +93,7 @@ def longest_part(motion, most, sagitta):
 def _place_root(motion, t, avatar, units, scene, pose, center):
     """Place the avatar's root sphere under M(t): center (3,) [steps]; pose is scratch.
 
-    Returns the radius with the reach, widened as in `find_reach`; a motion that stands still
+    Returns the radius with the reach, widened as in `voxels_in_reach`; a motion that stands still
     therefore reaches what a pose reaches.
     """
     pose_at(motion, t, pose)

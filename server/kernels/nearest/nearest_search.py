@@ -24,7 +24,14 @@ from ..core.array_references import with_flag
 from ..core.front_descent import GO_ON, Descent, descend_voxel, make_descent
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_bounds import U32, lanes_meet, locate_block, locate_voxel, nodes_meet
-from ..core.placed_avatar import lattice_to_units, place_block_once, place_front, place_nodes, place_root
+from ..core.placed_avatar import (
+    lattice_to_units,
+    make_front,
+    place_block_once,
+    place_front,
+    place_nodes,
+    place_root,
+)
 from ..core.reach import HELD, NOT_HELD, VALID, find_reach, resident_front, state_of
 from ..core.scene_arrays import LANES, leaf_class, node_class, stopped
 from .nearest_pair import (
@@ -132,13 +139,13 @@ def _search_below(avatar, m, extent, pose, scene, voxel, location, a, row, scrat
 
 
 @njit_inlined
-def _pass_flat(scene, location, row, at, block, threshold, scratch):
+def _pass_flat(scene, location, row, x, y, z, block, threshold, scratch):
     """Let the descent go on below a flat node: a tolerance only narrows the cut."""
     return GO_ON
 
 
 @njit_no_refcount
-def _nearest_voxel(avatar, m, extent, pose, scene, voxel, count, scratch):
+def _nearest_voxel(avatar, m, extent, pose, scene, voxel, front, count, scratch):
     """Search one resident voxel for a nearer pair; return `_least_left`."""
     words, best, descent = scene.words, scratch.best, scratch.descent
     placed, nodes, cut, off = descent.placed, descent.placed.nodes, best.cut, best.off
@@ -152,11 +159,11 @@ def _nearest_voxel(avatar, m, extent, pose, scene, voxel, count, scratch):
     if not nodes_meet(words, location.rows, x, y, z, nodes[3, 0], threshold):
         return np.inf
     _, entries = descend_voxel(
-        avatar, m, extent, pose, scene, voxel, location, count, scratch, cut, best.mask, False, _pass_flat,
-        _search_leaves, _search_below,
+        avatar, m, extent, pose, scene, voxel, location, front, count, scratch, cut, best.mask, False, False,
+        _pass_flat, _search_leaves, _search_below,
     )  # fmt: skip
     settle_candidates(best, avatar.points, m, placed.shift, scene.ints, scene.halves, placed.lanes)
-    return _least_left(words, descent.front.bounds, descent.stack, entries, off, best.frame[4])
+    return _least_left(words, front.bounds, descent.stack, entries, off, best.frame[4])
 
 
 @njit_no_refcount
@@ -175,7 +182,7 @@ def _least_left(words, bounds, stack, entries, off, error):
 
 
 @njit_no_refcount
-def _search_widening(avatar, m, extent, pose, scene, rows, beyond, first, last, count, scratch):
+def _search_widening(avatar, m, extent, pose, scene, rows, beyond, first, last, front, count, scratch):
     """Search the voxels rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
@@ -210,7 +217,7 @@ def _search_widening(avatar, m, extent, pose, scene, rows, beyond, first, last, 
             left = least
             if not stopped(scene.stop):
                 gaps[at] = -1.0 - least
-                left = _nearest_voxel(avatar, m, extent, pose, scene, rows[first + at], count, scratch)
+                left = _nearest_voxel(avatar, m, extent, pose, scene, rows[first + at], front, count, scratch)
             if left < np.inf:
                 for other in range(last - first):
                     if gaps[other] >= 0.0:
@@ -249,14 +256,14 @@ def nearest_poses(
     whose initial values are -1, inf and 0. Once the scene's stop flag is set, `missing_bound` of the
     pose in hand bounds what was not searched, and the poses after it are not finished.
     """
-    descent, most = make_descent(avatar), 0
+    descent, front, most = make_descent(avatar), make_front(avatar), 0
     best = make_best_pair(scene.radius_deficit, descent)
     best.frame[5], best.frame[6] = share, tolerance
     for number in range(which.shape[0]):
         i = which[number]
         most = max(most, reach.lists.starts[i + 1] - cursor[i])
     scratch = _SearchScratch(descent, best, np.empty(most), np.empty(most, np.uint64))
-    _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch)
+    _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, front, scratch)
 
 
 @njit_no_refcount
@@ -267,7 +274,9 @@ def nothing_nearer(nearest, i, near, scene):
 
 
 @njit_no_refcount
-def _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, scratch):
+def _nearest_poses(
+    poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, front, scratch
+):
     """Implement `nearest_poses` with its scratch passed in."""
     placed, best, gaps, classes = scratch.descent.placed, scratch.best, scratch.gaps, scratch.classes
     rows, near = reach.lists.rows, reach.lists.near
@@ -293,7 +302,7 @@ def _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, ne
         extent, farthest = place_root(avatar, m, placed, scene)
         if avatar.first[avatar.front_first] >= 0:  # there are nodes below the front
             place_nodes(avatar, m, placed, scene)
-        count = place_front(avatar, m, placed, scene, extent, scratch.descent.front.bounds)
+        count = place_front(avatar, m, placed, scene, extent, front.bounds)
         best.frame[0], best.frame[1] = extent, farthest
         best.units[0], best.units[1] = reach.units[i], reach.units[i]
         best.found[0] = nearest.square[i]
@@ -302,7 +311,7 @@ def _nearest_poses(poses, avatar, scene, reach, which, cursor, state, beyond, ne
         best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        left = _search_widening(avatar, m, extent, i, scene, rows, beyond, first, last, count, scratch)
+        left = _search_widening(avatar, m, extent, i, scene, rows, beyond, first, last, front, count, scratch)
         nearest.missing_bound[i] = min(nearest.missing_bound[i], left, unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):

@@ -19,7 +19,7 @@ from ..schemas.archive.units import UNITS_PER_METRE
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
 from ..schemas.scene.scene_file import SUFFIX, SceneFile
-from ..schemas.wire.requests import AddAvatarRequest
+from ..schemas.wire.requests import AddAvatarRequest, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import describe
@@ -85,7 +85,8 @@ def read_avatars(file: SceneFile, path: Path) -> list[FoundAvatar]:
                 avatar_file, item.radius, up=item.up, units=item.units, scale=item.scale, hollow=item.hollow
             )
         with error_location(path, f"$.avatars[{number}]"):
-            asked = AddAvatarRequest(item.name, shape.points, shape.radius, shape.inner_points)
+            points = make_positions(shape.points)
+            asked = AddAvatarRequest(item.name, points, shape.radius, shape.inner_points)
             model = make_avatar(asked.points, asked.radius, asked.inner_points)
             if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(

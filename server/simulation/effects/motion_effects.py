@@ -119,8 +119,9 @@ def make(effect: Stop | Sweep | Slide | Step | Ground, world: Any) -> Run:
         return StopRunner(world, effect, walks=not all(isinstance(each, _STILL) for each in effects)).run
     from ..world import walker
 
-    of = {Sweep: walker.FOLLOW, Slide: walker.SLIDE, Step: walker.STEP, Ground: walker.GROUND}
-    return partial(walker.walker_of(world).run, parts=sum(of.get(type(each), 0) for each in effects))
+    bits = {Sweep: walker.FOLLOW, Slide: walker.SLIDE, Step: walker.STEP, Ground: walker.GROUND}
+    parts = sum(bit for kind, bit in bits.items() if any(isinstance(each, kind) for each in effects))
+    return partial(walker.walker_of(world).run, parts=parts)
 
 
 class StopRunner:

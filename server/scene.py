@@ -43,23 +43,23 @@ from .avatars.avatar_model import AvatarModel, describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import Avatars, check_owner
 from .observability.request_stats import RequestStats
-from .queries.engine_table import ENGINES
-from .queries.objects import SCENE_GROUP
-from .queries.path import PATH_THREADS, largest_part, path_parts
-from .queries.request import EXACT, QueryBudget, make_budget, unknown_answers
-from .queries.scene_data import SceneData, with_stop
-from .residency.voxel_cache import VoxelCache
-from .residency.voxel_store import OpenStore, VoxelStore
-from .runtime.path_threads import PathThreads
-from .runtime.process_heap import give_back_freed_memory
-from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
-from .scene_archives import (
+from .open_scene_file import (
     error_location,
     find_archives,
     is_scene_file,
     open_archives,
     read_avatars,
 )
+from .queries.engine_table import ENGINES
+from .queries.load_and_search import unknown_answers
+from .queries.objects import SCENE_GROUP
+from .queries.path import PATH_THREADS, largest_part, path_parts
+from .queries.query_inputs import EXACT, QueryBudget, SceneData, make_budget, with_stop
+from .residency.voxel_cache import VoxelCache
+from .residency.voxel_store import OpenStore, VoxelStore
+from .runtime.path_threads import PathThreads
+from .runtime.process_heap import give_back_freed_memory
+from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, QueryMethods, list_avatars
 from .simulation.local_session import LocalSession
 from .simulation.simulation import Simulation, make_simulation
@@ -365,7 +365,7 @@ class Scene(QueryMethods):
         options: the remaining fields by name, and
 
         - budget_ms, and tolerance [m] and relative_tolerance of questions that take them: see
-          server/queries/request.py,
+          server/queries/query_inputs.py,
         - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
           scene's default,
         - stop: stop flag that ends the work early.

@@ -17,7 +17,7 @@ from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.engine_table import warm_engines
 from ..queries.level_of_detail import open_level_data, with_level
-from ..queries.scene_data import SceneData, make_scene_data, make_tree, with_radius_model
+from ..queries.query_inputs import SceneData, make_scene_data, make_tree, with_radius_model
 from ..residency.eviction import EvictionPolicy, prefetches
 from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks

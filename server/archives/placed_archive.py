@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.errors import BadRequestError, BusyError
 from ...schemas.wire.scene_messages import ReloadAnswer, SceneInfo
-from ..queries.raycast import make_directions
+from ..queries.rays_and_points import make_directions
 from ..residency.voxel_cache import VoxelCache
 from ..residency.voxel_store import OpenStore, VoxelStore
 from .archive_generation import ArchiveGeneration

@@ -1,5 +1,6 @@
 """Query `collide`: whether an avatar touches the scene, one verdict a pose."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,37 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.collide.collide_poses import collide_poses
+from ..kernels.collide.collide_poses import collide_poses, collide_resident
 from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .level_of_detail import below, find_level, level_budget, level_reach
-from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
-from .resolve import Search, Settle, Steps, answered, drop_items, load_and_search, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
+from .load_and_search import (
+    MAX_FAST_POINTS,
+    CostCounter,
+    Search,
+    Settle,
+    Steps,
+    answered,
+    cost_of_one,
+    drop_items,
+    load_and_search,
+    resolve,
+    search_resident,
+)
+from .query_inputs import (
+    EXACT,
+    LevelOfDetail,
+    QueryBudget,
+    SceneData,
+    check_request,
+    has_unknown,
+    kernel_poses,
+    refuse,
+    to_units,
+    unseen_from,
+    with_stop,
+)
 
 
 def collide_steps(
@@ -55,10 +79,30 @@ def collide_steps(
         unseen = np.minimum(left, unseen_from(data, reach))
         verdict[(unseen < np.inf) & (verdict == CLEAR)] = UNKNOWN
     bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
-    return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
+    return CollideAnswers(verdict, reach.outside, *counts, **spent.fields(), **bounds)
 
 
 collide = answered(collide_steps)
+
+
+def collide_fast(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
+) -> CollideAnswers:
+    """Answer `collide`, in one kernel call if there is one pose and the fast path applies."""
+    begin = time.perf_counter()
+    array = kernel_poses(poses)
+    if len(array) != 1 or len(avatar.points) > MAX_FAST_POINTS or budget.tolerance or has_unknown(data):
+        return collide(data, avatar, array, margin, budget)
+    verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
+    other_units = data.radius_units + to_units(margin, "margin")
+    before = array, avatar.reference, avatar.radius, other_units, 0
+    (fault, found, needed), outside = search_resident(
+        data, budget, collide_resident, before, (verdict, counts)
+    )
+    refuse(fault, 0, found)
+    if needed < 0:
+        return collide(data, avatar, array, margin, budget)
+    return CollideAnswers(verdict, outside, *counts, **cost_of_one(data, begin, needed))
 
 
 def _search(

@@ -15,6 +15,7 @@ pair is that with the least D2.
 """
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -34,17 +35,43 @@ from ..kernels.nearest.nearest_search import (
     NORMAL,
     SIGNED,
     nearest_poses,
+    nearest_resident,
     write_results,
 )
 from .level_of_detail import below, find_level, level_budget, level_reach
-from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
-from .resolve import Search, Steps, answered, drop_items, load_and_search, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
+from .load_and_search import (
+    MAX_FAST_POINTS,
+    CostCounter,
+    Search,
+    Steps,
+    answered,
+    cost_of_one,
+    drop_items,
+    load_and_search,
+    resolve,
+    search_resident,
+)
+from .query_inputs import (
+    EXACT,
+    LevelOfDetail,
+    QueryBudget,
+    SceneData,
+    check_request,
+    has_unknown,
+    kernel_poses,
+    refuse,
+    to_units,
+    unseen_from,
+    with_stop,
+)
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
 # Conversion to metres widens bounds by some exact units; a smaller tolerance has no effect.
 TOLERANCE_SLACK = 8.0
+# Limit of the reach in `search_resident` [m]: with nothing near, the time grows with the number of voxels.
+MAX_FAST_REACH = 2.0
+_CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
 
 
 def distance_steps(
@@ -109,6 +136,38 @@ def distance_steps(
 
 
 distance = answered(distance_steps)
+
+
+def distance_fast(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
+) -> DistanceAnswers:
+    """Answer `distance`, in one kernel call if there is one pose and the fast path applies."""
+    begin = time.perf_counter()
+    poses = kernel_poses(poses)
+    if (
+        len(poses) != 1
+        or not 0.0 <= reach <= MAX_FAST_REACH
+        or len(avatar.points) > MAX_FAST_POINTS
+        or has_unknown(data)
+    ):
+        return distance(data, avatar, poses, reach, budget)
+    reach_units = to_units(reach, "reach")
+    result = np.empty(COLUMNS)
+    before = poses, avatar.reference, avatar.radius, data.radius_units, reach_units, float(reach)
+    (fault, found, needed, visits, tests), outside = search_resident(
+        data, budget, nearest_resident, before, (result,)
+    )
+    refuse(fault, 0, found)
+    if needed < 0:
+        return distance(data, avatar, poses, reach, budget)
+    signed, row = result[SIGNED:LOWER], result[None]
+    return DistanceAnswers(
+        verdict=np.array([_CONTACT if signed[0] <= 0.0 else _CLEAR], np.uint8), signed_distance=signed,
+        lower=result[LOWER:NORMAL], upper=signed.copy(), exact=np.ones(1, bool), witness_avatar=row[:, AVATAR:CLOUD],
+        witness_cloud=row[:, CLOUD:], normal=row[:, NORMAL:AVATAR], outside=outside,
+        voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
+        point_tests=np.array([tests], np.uint32), **cost_of_one(data, begin, needed),
+    )  # fmt: skip
 
 
 def no_pairs(k: int) -> NearestPairs:

@@ -21,16 +21,13 @@ from ...schemas.wire.question_table import (
     WITHIN,
 )
 from ..avatars.avatar_model import make_avatar
-from .collide import collide
+from .collide import collide, collide_fast
 from .contacts import contacts
-from .distance import distance
+from .distance import distance, distance_fast
 from .objects import objects
-from .one_item import collide_fast, distance_fast, sweep_fast
-from .raycast import raycast
-from .request import EXACT, QueryBudget
-from .scene_data import SceneData
-from .sweep import sweep
-from .within import within
+from .query_inputs import EXACT, QueryBudget, SceneData
+from .rays_and_points import raycast, within
+from .sweep import sweep, sweep_fast
 
 ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,

@@ -21,9 +21,8 @@ from ..kernels.core.reach import VoxelLists
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..residency.voxel_cache import VoxelCache
 from ..runtime.stop_flag import StoppedError
-from .request import QueryBudget, check_request
-from .resolve import drop_entries
-from .scene_data import LevelOfDetail, SceneData, make_scene_data, with_stop
+from .load_and_search import drop_entries
+from .query_inputs import LevelOfDetail, QueryBudget, SceneData, check_request, make_scene_data, with_stop
 
 
 def open_level_data(

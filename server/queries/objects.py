@@ -17,9 +17,9 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..runtime.stop_flag import NO_STOP, StoppedError
-from .one_item import collide_fast
-from .request import EXACT, CostCounter, QueryBudget, check_avatar, kernel_poses
-from .scene_data import SceneData, to_units, with_stop
+from .collide import collide_fast
+from .load_and_search import CostCounter
+from .query_inputs import EXACT, QueryBudget, SceneData, check_avatar, kernel_poses, to_units, with_stop
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31

@@ -19,8 +19,8 @@ from ...schemas.wire.question_table import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at
 from .engine_table import ENGINES
-from .request import ask_until_stopped, check_avatar, kernel_poses, make_budget, unknown_answers
-from .scene_data import SceneData, to_units, with_stop
+from .load_and_search import ask_until_stopped, unknown_answers
+from .query_inputs import SceneData, check_avatar, kernel_poses, make_budget, to_units, with_stop
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2

@@ -1,5 +1,6 @@
 """Query `sweep`: first contact of an avatar with the scene on a motion between two poses."""
 
+import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,9 +11,11 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.array_references import record_type
 from ..kernels.core.reach import VoxelLists
 from ..kernels.motion.sweep_advance import advance_segments
-from ..kernels.motion.sweep_resident import make_scratch
+from ..kernels.motion.sweep_one import sweep_one
+from ..kernels.motion.sweep_resident import SWEPT, make_scratch
 from ..kernels.motion.sweep_segments import (
     SweepProgress,
     find_unknown_regions,
@@ -21,15 +24,33 @@ from ..kernels.motion.sweep_segments import (
 )
 from ..runtime.stop_flag import StoppedError
 from .level_of_detail import below, find_level, level_budget
-from .request import EXACT, CostCounter, QueryBudget, check_avatar, kernel_poses
-from .resolve import Steps, answered, drop_items, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
+from .load_and_search import (
+    MAX_FAST_POINTS,
+    CostCounter,
+    Steps,
+    answered,
+    cost_of_one,
+    drop_items,
+    resolve,
+    search_resident,
+)
+from .query_inputs import (
+    EXACT,
+    LevelOfDetail,
+    QueryBudget,
+    SceneData,
+    check_avatar,
+    kernel_poses,
+    to_units,
+    with_stop,
+)
 
 # `tolerance` of a request that gives none [m].
 DEFAULT_TOLERANCE = 1e-6
 # Tolerance of a sweep through the level, as a share of the request's, and at least [m]: no time is spent
 # on less than covers.
 _LEVEL_SHARE, _LEVEL_LEAST = 0.25, 1e-4
+_SWEPT = record_type(*SWEPT)
 
 
 def _from_origin(
@@ -187,6 +208,49 @@ def sweep_steps(
 
 
 sweep = answered(sweep_steps)
+
+
+def sweep_fast(
+    data: SceneData,
+    avatar: AvatarModel,
+    pose_from: ArrayLike,
+    pose_to: ArrayLike,
+    margin: float = 0.0,
+    tolerance: float = 0.0,
+    budget: QueryBudget = EXACT,
+) -> SweepAnswers:
+    """Answer `sweep`, in one kernel call if there is one motion and the fast path applies."""
+    begin = time.perf_counter()
+    first, last = kernel_poses(pose_from), kernel_poses(pose_to)
+    most = max(tolerance, budget.tolerance)
+    if (
+        len(first) != 1
+        or len(last) != 1
+        or not 0.0 <= tolerance < np.inf
+        or not 0 < len(avatar.points) <= MAX_FAST_POINTS
+    ):
+        return sweep(data, avatar, first, last, margin, tolerance, budget)
+    result, outside = np.zeros(1, _SWEPT), np.zeros(1, bool)
+    other_units = data.radius_units + to_units(margin, "margin")
+    before = first[0], last[0], avatar.reference, make_scratch(avatar.arrays), other_units
+    after = data.nothing_clear, float(most), result[0], outside
+    (needed, said, visits, tests, steps), _ = search_resident(
+        data, budget, sweep_one, before, after, examined=0
+    )
+    if needed < 0:
+        return sweep(data, avatar, first, last, margin, tolerance, budget)
+    lower, upper, touches = result["lower"], result["upper"], said == Verdict.CONTACT
+    exact = np.full(1, said == Verdict.CLEAR)
+    if touches:
+        exact = (result["speed"] * (upper - lower) <= most) | (upper == lower)
+    nothing: NDArray[np.float64] = np.full((1, 3), np.nan)
+    return SweepAnswers(
+        verdict=np.array([said], np.uint8), lower=lower, upper=upper, exact=exact,
+        witness_avatar=result["avatar"] if touches else nothing,
+        witness_cloud=result["cloud"] if touches else nothing.copy(), steps=np.array([steps], np.uint32),
+        outside=outside, voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
+        point_tests=np.array([tests], np.uint32), **cost_of_one(data, begin, needed),
+    )  # fmt: skip
 
 
 def _plan(

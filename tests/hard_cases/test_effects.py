@@ -64,7 +64,6 @@ FILES = {
 MOVING = {"sweep", "slide", "ground", "step", "crowd"}
 # What only some effects have a use for, and which.
 HELPERS = {
-    "server.queries.distance_per_scan": {"uncertainty"},
     "server.archives.masked_store": {"through"},
     "server.simulation.world.bodies": {"objects", "crowd"},
     "server.simulation.world.body_obstacles": {"objects", "crowd"},

@@ -6,10 +6,9 @@ from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.core.reach import MISSING, NOT_HELD, Items, VoxelLists, find_lists
 from solidcloud.server.kernels.core.scene_arrays import LANES, SceneArrays
-from solidcloud.server.queries.nearest_hits import make_origins
-from solidcloud.server.queries.request import EXACT, CostCounter, QueryBudget
-from solidcloud.server.queries.resolve import Steps, resolve, run
-from solidcloud.server.queries.scene_data import SceneData, to_units
+from solidcloud.server.queries.load_and_search import CostCounter, Steps, resolve, run
+from solidcloud.server.queries.query_inputs import EXACT, QueryBudget, SceneData, to_units
+from solidcloud.server.queries.rays_and_points import make_origins
 
 
 def count_within(

@@ -17,7 +17,7 @@ from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
 from ....schemas.wire.stats import EffectStats
-from ...queries.request import EXACT, QueryBudget
+from ...queries.query_inputs import EXACT, QueryBudget
 from ...runtime.stop_flag import StoppedError
 from ..world.collision_world import World
 from ..world.frame import MAX_TOUCHED, Body, Frame, Hit, Pose, Run, Vec

@@ -20,7 +20,7 @@ from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...queries.scene_data import to_units
+from ...queries.query_inputs import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Pose, Vec
 from .vectors import horizontal, rotate, rotate_back

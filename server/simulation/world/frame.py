@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...queries.request import EXACT, QueryBudget
+from ...queries.query_inputs import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
 Vec = NDArray[np.float64]  # (3,) [m]

@@ -16,7 +16,8 @@ from ...archives.rigid_transform import transform_points
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
 from ...kernels.motion.sweep_resident import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
-from ...queries.request import QueryBudget, parts_that_fit
+from ...queries.load_and_search import parts_that_fit
+from ...queries.query_inputs import QueryBudget
 from .frame import (
     Frame,
     Hit,

@@ -1,14 +1,16 @@
-"""The one way in which every query gets the voxels that it needs: a generator of slices.
+"""Load the missing voxels of a query slice by slice, and search them, until a deadline or a cancel.
 
-A query lists the voxels in reach of each of its items (poses, points, rays, motions), nearest first
-(kernels/core/reach.py), and gives the search that examines them. `resolve` first searches the voxels
-that are resident. What these leave open, the query may settle in another way, for example by the
-level of detail (level_of_detail.py). The rest is loaded: `load_and_search` repeats a round until
-every item is finished. A round holds the next voxel of each item, and all later ones that are
-resident, as many as fit in SHARE of the cache, and calls the search, which goes on where each item
-stopped. A hit in the first voxel therefore loads no second one. A query whose items need their
-voxels together, because it cannot compare parts of an answer exactly (sweep) or collects one item at
-a time (contacts), holds all voxels of as many whole items as fit.
+Every query gets its voxels in this way, by a generator of slices. It lists the voxels in reach of
+each of its items (poses, points, rays, motions), nearest first (kernels/core/reach.py), and gives
+the search that examines them. One item whose voxels are resident takes a single kernel call,
+`search_resident`. Otherwise `resolve` first searches the voxels that are resident. What these leave
+open, the query may settle in another way, for example by the level of detail (level_of_detail.py).
+The rest is loaded: `load_and_search` repeats a round until every item is finished. A round holds
+the next voxel of each item, and all later ones that are resident, as many as fit in SHARE of the
+cache, and calls the search, which goes on where each item stopped. A hit in the first voxel
+therefore loads no second one. A query whose items need their voxels together, because it cannot
+compare parts of an answer exactly (sweep) or collects one item at a time (contacts), holds all
+voxels of as many whole items as fit.
 
 Between two rounds the generator yields, holding nothing. Whoever runs it decides what happens there:
 `run` goes on at once.
@@ -17,21 +19,30 @@ A voxel that cannot be read, that comes too late, or that the budget does not wa
 search bounds it by its box. Loads that came too late are owed (residency).
 """
 
-from collections.abc import Callable, Generator
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
+from ...schemas.wire.answers import Cost
+from ...schemas.wire.question_rules import Question
 from ..kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from .request import CostCounter, QueryBudget, parts_that_fit
-from .scene_data import SceneData
+from ..residency.voxel_cache import HeldVoxels, VoxelCache
+from ..runtime.stop_flag import StoppedError
+from .query_inputs import QueryBudget, SceneData
 
 _A = TypeVar("_A")
+_C = TypeVar("_C", bound=Cost)
 _P = ParamSpec("_P")
 # Share of the cache that a round holds at once: the rest stays with the voxels kept for users.
 SHARE = 0.5
+# Limit of the points of an avatar in `search_resident`: 20 µs for the 3,617 points of the walk. Larger
+# avatars could block other requests, and gain little.
+MAX_FAST_POINTS = 1 << 13
 
 # What a query is: it yields between two slices of its work, and returns its answers.
 Steps = Generator[None, None, _A]
@@ -63,6 +74,124 @@ def answered(steps: Callable[_P, Steps[_A]]) -> Callable[_P, _A]:
 
     answer.__name__ = steps.__name__.removesuffix("_steps")
     return answer
+
+
+class CostCounter:
+    """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
+
+    __slots__ = (
+        "_begin",
+        "_keys",
+        "_residency",
+        "faults",
+        "hits",
+        "late",
+        "loaded",
+        "misses",
+        "wait_seconds",
+    )
+
+    def __init__(self, data: SceneData) -> None:
+        """Begin now with zero cost. data: of the scene that is queried."""
+        self._begin, self._residency, self._keys = time.perf_counter(), data.residency, data.keys
+        self.hits = self.misses = 0
+        self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
+        self.wait_seconds = 0.0
+        self.faults: dict[str, None] = {}
+        self.late: dict[int, None] = {}
+
+    def add(self, held: HeldVoxels, again: int = 0) -> None:
+        """Add a hold. again: number of its hits on voxels that the request has held before."""
+        found = held.hits - again - self.loaded
+        self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
+        self.misses += held.misses
+        self.wait_seconds += held.waited
+        self.faults.update(dict.fromkeys(held.faults))
+        self.late.update(dict.fromkeys(held.late))
+
+    def add_cost(self, cost: Cost) -> None:
+        """Add the cost of another query of the same data."""
+        rows = [int(self._keys.searchsorted(key)) for key in cost.late]
+        self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
+
+    def add_level(self, cost: "CostCounter | Cost") -> None:
+        """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
+        self.wait_seconds += cost.wait_seconds
+        self.faults.update(dict.fromkeys(cost.faults))
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of `Cost`; call it when the answer is complete."""
+        return {
+            "engine_seconds": time.perf_counter() - self._begin,
+            "hits": self.hits,
+            "misses": self.misses,
+            "resident": self._residency.resident,
+            "resident_bytes": self._residency.resident_bytes,
+            "faults": tuple(self.faults),
+            "wait_seconds": self.wait_seconds,
+            "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
+        }
+
+
+def ask_until_stopped(question: Question[_C], k: int, budget: QueryBudget, ask: Callable[[], _C]) -> _C:
+    """Run a query of k items with `ask`. Add the reason to the answer if the request is stopped."""
+    try:
+        answers = ask()
+    except StoppedError:
+        return unknown_answers(question, k, budget)
+    return structs.replace(answers, stopped=budget.stopped) if budget.stopped else answers
+
+
+def unknown_answers(question: Question[_C], k: int, budget: QueryBudget) -> _C:
+    """Return `Question.unknown` for the k items of a stopped request, with the reason."""
+    answers = question.unknown(k, bounded=budget.tolerance > 0.0)
+    return structs.replace(answers, stopped=budget.stopped)
+
+
+def search_resident(
+    data: SceneData,
+    budget: QueryBudget,
+    kernel: Any,
+    before: tuple[Any, ...],
+    after: tuple[Any, ...],
+    examined: int = 2,
+) -> tuple[Any, NDArray[np.bool_]]:
+    """Answer a query of one item by a single kernel call, if resident voxels answer it.
+
+    The answers equal those of the slices bit for bit, cost counters included, except engine_seconds and
+    `hits`, the voxels that were examined instead of all in reach; with a tolerance, the distance is the
+    exact one. For `collide` and `distance`, resident voxels suffice if nothing in the others changes the
+    answer. Callers do not use it for avatars of more than MAX_FAST_POINTS points, nor, except `sweep`,
+    if a scan was left out of the archive or a load proved its index wrong.
+
+    The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
+    of the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits
+    keep it to some tens of microseconds.
+
+    kernel: takes `before`, a reference to the scene, the stop flag, and `after`.  examined: position in
+    the kernel's result of the number of voxels examined; negative: a voxel has to be loaded, too many are
+    in reach, or the request was stopped.
+    Return the kernel's result, and whether the reach of the pose leaves the scene (1,).
+    """
+    residency, held = data.residency, data.references.to(data.arrays, data.tree)
+    with residency.frozen():
+        found = held.call(kernel, *before, held.reference, budget.stop.flag, *after)
+        outside = held.outside.copy()
+        if found[examined] > 0:
+            residency.use(held.rows[: found[examined]].tolist(), scan=budget.scan)
+    return found, outside
+
+
+def cost_of_one(data: SceneData, begin: float, hits: int) -> dict[str, Any]:
+    """Return the fields of `Cost` of a query that `search_resident` answered.
+
+    begin: on time.perf_counter()'s clock [s].  hits: the voxels examined.
+    """
+    residency = data.residency
+    return {
+        "engine_seconds": time.perf_counter() - begin, "hits": hits,
+        "resident": residency.resident, "resident_bytes": residency.resident_bytes,
+    }  # fmt: skip
 
 
 def resolve(
@@ -211,3 +340,18 @@ def drop_entries(lists: VoxelLists, dropped: NDArray[np.bool_]) -> VoxelLists:
 def drop_items(lists: VoxelLists, dropped: NDArray[np.bool_]) -> VoxelLists:
     """Return lists in which some items have no entries. dropped: (k,) bool."""
     return drop_entries(lists, dropped[items_of(lists)])
+
+
+def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: float) -> Iterator[list[int]]:
+    """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
+    part: list[int] = []
+    taken = 0
+    for row in rows:
+        size = residency.bytes_of([row])
+        if part and taken + size > budget_bytes:
+            yield part
+            part, taken = [], 0
+        part.append(row)
+        taken += size
+    if part:
+        yield part

@@ -8,8 +8,8 @@ import pytest
 from fake_store import BLOCK, FakeStore
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from solidcloud.server.queries.request import EXACT, CostCounter, LateVoxels, QueryBudget
-from solidcloud.server.queries.resolve import (
+from solidcloud.server.queries.load_and_search import (
+    CostCounter,
     Steps,
     drop_entries,
     drop_items,
@@ -17,6 +17,7 @@ from solidcloud.server.queries.resolve import (
     resolve,
     run,
 )
+from solidcloud.server.queries.query_inputs import EXACT, LateVoxels, QueryBudget
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import StopFlag
 

@@ -12,39 +12,33 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses, collide_resident
 from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import VoxelsInReach
-from .level_of_detail import below, find_level, level_budget, level_reach
+from .level_of_detail import ask_level, below, find_level, search_level
 from .load_and_search import (
     MAX_FAST_POINTS,
-    CostCounter,
     Search,
     Settle,
-    Steps,
-    answered,
     cost_of_one,
     drop_items,
-    load_and_search,
     resolve,
     search_resident,
 )
 from .query_inputs import (
     EXACT,
     LevelOfDetail,
+    PoseQuery,
     QueryBudget,
     SceneData,
-    check_request,
     has_unknown,
     kernel_poses,
+    make_query,
     refuse,
     to_units,
-    unseen_from,
-    with_stop,
 )
 
 
-def collide_steps(
+def collide(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
-) -> Steps[CollideAnswers]:
+) -> CollideAnswers:
     """Test whether the avatar touches the scene under each pose.
 
     poses: (k, 4, 4) float64, avatar to world, rigid, bits used as given.
@@ -55,34 +49,28 @@ def collide_steps(
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    spent = CostCounter(data)
-    array, margin_units = kernel_poses(poses), to_units(margin, "margin")
-    reach = check_request(data, avatar, array, data.radius_units + margin_units)
-    verdict, counts = np.zeros(len(array), np.uint8), np.zeros((3, len(array)), np.uint32)
+    margin_units = to_units(margin, "margin")
+    query = make_query(data, avatar, poses, margin_units, budget)
+    verdict, counts = np.zeros(len(query.poses), np.uint8), np.zeros((3, len(query.poses)), np.uint32)
     level = find_level(data, budget)
-    drop_clear = drop_clear_of(level, avatar, array, margin_units, budget, spent)
+    drop_clear = drop_clear_of(level, query)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         lists = drop_items(lists, (verdict == CONTACT) | (verdict == EARLY))
         if level is None or drop_clear is None:
             return lists
-        lists = yield from drop_clear(lists)
+        lists = drop_clear(lists)
         which = np.flatnonzero(np.diff(lists.starts))
-        touches = yield from _touch_level(level, avatar, array[which], margin_units, budget, spent)
-        verdict[which[touches]] = EARLY if budget.tolerance_units else CONTACT
+        verdict[which[_touch_level(level, query, which)]] = EARLY if budget.tolerance_units else CONTACT
         return drop_items(lists, (verdict == CONTACT) | (verdict == EARLY))
 
-    if len(avatar.points):
-        own = with_stop(data, budget.stop)
-        search = _search(own, avatar, array, reach, budget.tolerance_units, verdict, counts)
-        left = yield from resolve(data, reach.lists, search, budget, spent, settle)
-        unseen = np.minimum(left, unseen_from(data, reach))
-        verdict[(unseen < np.inf) & (verdict == CLEAR)] = UNKNOWN
-    bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
-    return CollideAnswers(verdict, reach.outside, *counts, **spent.fields(), **bounds)
-
-
-collide = answered(collide_steps)
+    search = _search(query, budget.tolerance_units, verdict, counts)
+    left = resolve(query.data, query.around.lists, search, budget, query.spent, settle)
+    verdict[(np.minimum(left, query.unseen) < np.inf) & (verdict == CLEAR)] = UNKNOWN
+    bounds = verdict_bounds(verdict, query.radii, margin, margin_units, budget)
+    missing, visits, tests = counts
+    cost = query.spent.fields()
+    return CollideAnswers(verdict, query.around.outside, missing, visits, tests, **cost, **bounds)
 
 
 def collide_fast(
@@ -106,84 +94,54 @@ def collide_fast(
 
 
 def _search(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    reach: VoxelsInReach,
-    tolerance_units: int,
-    verdict: NDArray[np.uint8],
-    counts: NDArray[np.uint32],
+    query: PoseQuery, tolerance_units: int, verdict: NDArray[np.uint8], counts: NDArray[np.uint32]
 ) -> Search:
     """Return the search of `resolve`: it writes verdict (k,) and counts (3, k)."""
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
-        own = reach._replace(lists=lists)
-        collide_poses(poses, avatar.arrays, data.arrays, own, *state, tolerance_units, verdict, counts)
+        own = query.around._replace(lists=lists)
+        collide_poses(
+            query.poses, query.avatar.arrays, query.data.arrays, own, *state, tolerance_units, verdict, counts
+        )
 
     return search
 
 
-def drop_clear_of(
-    level: LevelOfDetail | None,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    margin_units: int,
-    budget: QueryBudget,
-    spent: CostCounter,
-) -> Settle | None:
-    """Return the `settle` of `resolve` that drops those of poses (k, 4, 4) which the level proves clear.
-
-    Return None without a level.
-    """
+def drop_clear_of(level: LevelOfDetail | None, query: PoseQuery) -> Settle | None:
+    """Return the `settle` of `resolve` that drops the poses which the level proves clear; None without one."""
     if level is None:
         return None
     covers = level.covers
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
-        which, rows = np.flatnonzero(np.diff(lists.starts)), lists.rows[: lists.starts[-1]]
-        own = poses[which]
-        reach = level_reach(covers, avatar, own, margin_units) if len(which) else None
-        if reach is None:
+    def settle(lists: VoxelLists) -> VoxelLists:
+        which = np.flatnonzero(np.diff(lists.starts))
+        asked = ask_level(query, covers, which, query.beyond)
+        if asked is None:
             return lists
-        reach = reach._replace(lists=below(level, reach.lists, rows))
-        verdict, left = yield from _search_level(covers, avatar, own, reach, budget, spent)
-        clear = np.zeros(len(poses), bool)
+        own = below(level, asked.around.lists, lists.rows[: lists.starts[-1]])
+        verdict, left = _search_level(query, asked, own)
+        clear = np.zeros(len(query.poses), bool)
         clear[which] = (verdict == CLEAR) & (left == np.inf) & (not covers.nothing_clear)
         return drop_items(lists, clear)
 
     return settle
 
 
-def _touch_level(
-    level: LevelOfDetail,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    margin_units: int,
-    budget: QueryBudget,
-    spent: CostCounter,
-) -> Steps[NDArray[np.bool_]]:
-    """Return which poses (k,) touch a representative, within margin plus tolerance."""
-    reach = level_reach(level.points, avatar, poses, margin_units + budget.tolerance_units)
-    if reach is None:
-        return np.zeros(len(poses), bool)
-    verdict, _ = yield from _search_level(level.points, avatar, poses, reach, budget, spent)
+def _touch_level(level: LevelOfDetail, query: PoseQuery, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of the poses numbered in `which` touch a representative, within margin plus tolerance."""
+    asked = ask_level(query, level.points, which, query.beyond + query.budget.tolerance_units)
+    if asked is None:
+        return np.zeros(len(which), bool)
+    verdict, _ = _search_level(query, asked, asked.around.lists)
     return np.asarray(verdict == CONTACT)
 
 
 def _search_level(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    reach: VoxelsInReach,
-    budget: QueryBudget,
-    spent: CostCounter,
-) -> Steps[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
-    """Return the verdicts (k,) of poses in covers or points of a level, and what `resolve` returns."""
-    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
-    search, own = _search(data, avatar, poses, reach, 0, verdict, counts), CostCounter(data)
-    left = yield from load_and_search(data, reach.lists, search, level_budget(budget), own)
-    spent.add_level(own)
-    return verdict, left
+    query: PoseQuery, asked: PoseQuery, lists: VoxelLists
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Return the verdicts (k,) of the poses asked in voxels of a level, and what `search_level` returns."""
+    verdict, counts = np.zeros(len(asked.poses), np.uint8), np.zeros((3, len(asked.poses)), np.uint32)
+    return verdict, search_level(query, asked, lists, _search(asked, 0, verdict, counts))
 
 
 def verdict_bounds(

@@ -25,7 +25,6 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
-from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import (
     AVATAR,
@@ -38,31 +37,19 @@ from ..kernels.nearest.nearest_search import (
     nearest_resident,
     write_results,
 )
-from .level_of_detail import below, find_level, level_budget, level_reach
-from .load_and_search import (
-    MAX_FAST_POINTS,
-    CostCounter,
-    Search,
-    Steps,
-    answered,
-    cost_of_one,
-    drop_items,
-    load_and_search,
-    resolve,
-    search_resident,
-)
+from .level_of_detail import ask_level, below, find_level, search_level
+from .load_and_search import MAX_FAST_POINTS, Search, cost_of_one, drop_items, resolve, search_resident
 from .query_inputs import (
     EXACT,
     LevelOfDetail,
+    PoseQuery,
     QueryBudget,
     SceneData,
-    check_request,
     has_unknown,
     kernel_poses,
+    make_query,
     refuse,
     to_units,
-    unseen_from,
-    with_stop,
 )
 
 # Rounding of square roots and of placed points in a bound [exact units].
@@ -71,12 +58,11 @@ _ROUNDING = 4.0
 TOLERANCE_SLACK = 8.0
 # Limit of the reach in `search_resident` [m]: with nothing near, the time grows with the number of voxels.
 MAX_FAST_REACH = 2.0
-_CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
 
 
-def distance_steps(
+def distance(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
-) -> Steps[DistanceAnswers]:
+) -> DistanceAnswers:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
     poses: (k, 4, 4) float64, avatar to world, rigid.
@@ -88,54 +74,37 @@ def distance_steps(
     examined pair, and exact only if nothing else can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    spent = CostCounter(data)
-    array, reach_units = kernel_poses(poses), to_units(reach, "reach")
-    around = check_request(data, avatar, array, data.radius_units + reach_units)
-    nearest, counts = no_pairs(len(array)), np.zeros((3, len(array)), np.uint32)
+    reach_units = to_units(reach, "reach")
+    query = make_query(data, avatar, poses, reach_units, budget)
+    k, per_step = len(query.poses), data.arrays.units_per_step
+    nearest, counts = no_pairs(k), np.zeros((3, k), np.uint32)
     # A level does not know the radii of a scene with several.
     level = find_level(data, budget) if len(data.arrays.radius_deficit) == 1 else None
 
     # Of what absent voxels hold, by the level; of those that need not be loaded; of the others [steps].
-    absent_bound, settled_bound = np.zeros(len(array)), np.full(len(array), np.inf)
-    resident_bound = np.full(len(array), np.inf)
+    absent_bound, settled_bound = np.zeros(k), np.full(k, np.inf)
+    resident_bound = np.full(k, np.inf)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         lists = _drop_farther(data, lists, nearest)
         resident_bound[:], nearest.missing_bound[:] = nearest.missing_bound, np.inf
         which = np.flatnonzero(np.diff(lists.starts))
         if level is None or not len(which):
             return lists
-        absent_bound[which] = yield from _ask_level(
-            level,
-            avatar,
-            array[which],
-            which,
-            lists.rows[: lists.starts[-1]],
-            reach_units,
-            budget,
-            nearest,
-            spent,
-        )
-        units = absent_bound * data.arrays.units_per_step
-        settled = _is_within(nearest, units, around.units, budget)
+        absent_bound[which] = _bound_by_level(level, query, which, lists.rows[: lists.starts[-1]], nearest)
+        settled = _is_within(nearest, absent_bound * per_step, query.around.units, budget)
         settled_bound[which] = np.where(settled, absent_bound, np.inf)[which]
         return drop_items(lists, settled)
 
-    if len(avatar.points):
-        search = _search(
-            with_stop(data, budget.stop), avatar, array, around, reach_units, budget, nearest, counts
-        )
-        left = yield from resolve(data, around.lists, search, budget, spent, settle)
-        missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
-        missing = np.minimum(missing, settled_bound)
-        np.minimum(missing, resident_bound, out=nearest.missing_bound)
-        np.minimum(nearest.missing_bound, unseen_from(data, around), out=nearest.missing_bound)
-    return DistanceAnswers(
-        **_columns(data, around, float(reach), reach_units, nearest, counts), **spent.fields()
+    left = resolve(
+        query.data, query.around.lists, _search(query, nearest, counts), budget, query.spent, settle
     )
-
-
-distance = answered(distance_steps)
+    missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
+    missing = np.minimum(missing, settled_bound)
+    nearest.missing_bound[:] = np.minimum(np.minimum(missing, resident_bound), query.unseen)
+    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
+    write_results(nearest, query.radii, float(reach), data.arrays, results, exact)
+    return _answers(results, exact, query.around.outside, counts, query.spent.fields())
 
 
 def distance_fast(
@@ -160,14 +129,8 @@ def distance_fast(
     refuse(fault, 0, found)
     if needed < 0:
         return distance(data, avatar, poses, reach, budget)
-    signed, row = result[SIGNED:LOWER], result[None]
-    return DistanceAnswers(
-        verdict=np.array([_CONTACT if signed[0] <= 0.0 else _CLEAR], np.uint8), signed_distance=signed,
-        lower=result[LOWER:NORMAL], upper=signed.copy(), exact=np.ones(1, bool), witness_avatar=row[:, AVATAR:CLOUD],
-        witness_cloud=row[:, CLOUD:], normal=row[:, NORMAL:AVATAR], outside=outside,
-        voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
-        point_tests=np.array([tests], np.uint32), **cost_of_one(data, begin, needed),
-    )  # fmt: skip
+    counts = np.array([[0], [visits], [tests]], np.uint32)
+    return _answers(result[None], np.ones(1, bool), outside, counts, cost_of_one(data, begin, needed))
 
 
 def no_pairs(k: int) -> NearestPairs:
@@ -177,26 +140,18 @@ def no_pairs(k: int) -> NearestPairs:
     )
 
 
-def _search(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    reach: VoxelsInReach,
-    beyond: int,
-    budget: QueryBudget,
-    nearest: NearestPairs,
-    counts: NDArray[np.uint32],
-) -> Search:
+def _search(query: PoseQuery, nearest: NearestPairs, counts: NDArray[np.uint32]) -> Search:
     """Return the search of `resolve`: it writes `nearest` and counts (3, k)."""
+    budget = query.budget
     tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
 
     def search(
         lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
     ) -> None:
-        own = reach._replace(lists=lists)
+        own = query.around._replace(lists=lists)
         nearest_poses(
-            poses, avatar.arrays, data.arrays, own, which, cursor, state, beyond, budget.relative, tolerance,
-            nearest, counts,
+            query.poses, query.avatar.arrays, query.data.arrays, own, which, cursor, state, query.beyond,
+            budget.relative, tolerance, nearest, counts,
         )  # fmt: skip
 
     return search
@@ -212,32 +167,25 @@ def _drop_farther(data: SceneData, lists: VoxelLists, nearest: NearestPairs) -> 
     return drop_items(lists, (nearest.square >= 0) & (next_units > found))
 
 
-def _ask_level(
+def _bound_by_level(
     level: LevelOfDetail,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
+    query: PoseQuery,
     which: NDArray[np.int64],
     rows: NDArray[np.int64],
-    reach_units: int,
-    budget: QueryBudget,
     nearest: NearestPairs,
-    spent: CostCounter,
-) -> Steps[NDArray[np.float64]]:
-    """Return lower bounds (k,) of the distance of the scene's voxels `rows` from the avatar's centres [steps].
+) -> NDArray[np.float64]:
+    """Return lower bounds of the distance of the scene's voxels `rows` from the avatar's centres [steps].
 
-    Of poses (k, 4, 4), numbers `which`. A representative nearer than the pair in `nearest` replaces it.
+    Of the poses numbered in `which`. A representative nearer than the pair in `nearest` replaces it.
     """
-    k, covers, points, exact = len(poses), level.covers, level.points, level_budget(budget)
-    around, near = (level_reach(each, avatar, poses, reach_units) for each in (covers, points))
-    if around is None or near is None:
+    k, covers, points = len(which), level.covers, level.points
+    by_covers, by_points = (ask_level(query, each, which, query.beyond) for each in (covers, points))
+    if by_covers is None or by_points is None:
         return np.zeros(k)
-    own, counts = CostCounter(covers), np.zeros((3, k), np.uint32)
-    covered, pairs = no_pairs(k), no_pairs(k)
-    search = _search(covers, avatar, poses, around, reach_units, exact, covered, counts)
-    left = yield from load_and_search(covers, below(level, around.lists, rows), search, exact, own)
-    search = _search(points, avatar, poses, near, reach_units, exact, pairs, counts)
-    yield from load_and_search(points, near.lists, search, exact, own)
-    spent.add_level(own)
+    covered, pairs, counts = no_pairs(k), no_pairs(k), np.zeros((3, k), np.uint32)
+    own = below(level, by_covers.around.lists, rows)
+    left = search_level(query, by_covers, own, _search(by_covers, covered, counts))
+    search_level(query, by_points, by_points.around.lists, _search(by_points, pairs, counts))
     closer = _lengths(pairs) < _lengths(nearest)[which]
     at = which[closer]
     nearest.square[at], nearest.pair[at], nearest.deficit[at] = pairs.square[closer], pairs.pair[closer], 0
@@ -281,28 +229,19 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
     return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
 
 
-def _columns(
-    data: SceneData,
-    reach: VoxelsInReach,
-    farthest: float,
-    reach_units: int,
-    nearest: NearestPairs,
+def _answers(
+    results: NDArray[np.float64],
+    exact: NDArray[np.bool_],
+    outside: NDArray[np.bool_],
     counts: NDArray[np.uint32],
-) -> dict[str, Any]:
-    """Return the fields of `DistanceAnswers` except the cost of the request.
-
-    farthest: the requested reach [m].  reach_units: the same, exact units.
-    nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
-    examined.
-    """
-    k = len(nearest.square)
-    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
-    write_results(nearest, reach.units - reach_units, farthest, data.arrays, results, exact)
+    cost: dict[str, Any],
+) -> DistanceAnswers:
+    """Make the answers from results (k, COLUMNS), as `write_results` writes them, and counts (3, k)."""
     signed, lower = results[:, SIGNED].copy(), results[:, LOWER].copy()
     clear = np.where(exact | (lower > 0), Verdict.CLEAR, Verdict.UNKNOWN)
-    return {
-        "verdict": np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), "signed_distance": signed,
-        "lower": lower, "upper": signed.copy(), "exact": exact, "witness_avatar": results[:, AVATAR:CLOUD].copy(),
-        "witness_cloud": results[:, CLOUD:].copy(), "normal": results[:, NORMAL:AVATAR].copy(),
-        "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
-    }  # fmt: skip
+    return DistanceAnswers(
+        verdict=np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), signed_distance=signed,
+        lower=lower, upper=signed.copy(), exact=exact, witness_avatar=results[:, AVATAR:CLOUD].copy(),
+        witness_cloud=results[:, CLOUD:].copy(), normal=results[:, NORMAL:AVATAR].copy(), outside=outside,
+        voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2], **cost,
+    )  # fmt: skip

@@ -1,28 +1,24 @@
 """Load the missing voxels of a query slice by slice, and search them, until a deadline or a cancel.
 
-Every query gets its voxels in this way, by a generator of slices. It lists the voxels in reach of
-each of its items (poses, points, rays, motions), nearest first (kernels/core/reach.py), and gives
-the search that examines them. One item whose voxels are resident takes a single kernel call,
-`search_resident`. Otherwise `resolve` first searches the voxels that are resident. What these leave
-open, the query may settle in another way, for example by the level of detail (level_of_detail.py).
-The rest is loaded: `load_and_search` repeats a round until every item is finished. A round holds
-the next voxel of each item, and all later ones that are resident, as many as fit in SHARE of the
-cache, and calls the search, which goes on where each item stopped. A hit in the first voxel
-therefore loads no second one. A query whose items need their voxels together, because it cannot
-compare parts of an answer exactly (sweep) or collects one item at a time (contacts), holds all
-voxels of as many whole items as fit.
-
-Between two rounds the generator yields, holding nothing. Whoever runs it decides what happens there:
-`run` goes on at once.
+Every query gets its voxels in this way. It lists the voxels in reach of each of its items (poses,
+points, rays, motions), nearest first (kernels/core/reach.py), and gives the search that examines
+them. One item whose voxels are resident takes a single kernel call, `search_resident`. Otherwise
+`resolve` first searches the voxels that are resident. What these leave open, the query may settle in
+another way, for example by the level of detail (level_of_detail.py). The rest is loaded:
+`load_and_search` repeats a slice until every item is finished. A slice holds the next voxel of each
+item, and all later ones that are resident, as many as fit in SHARE of the cache, and calls the
+search, which goes on where each item stopped. A hit in the first voxel therefore loads no second
+one. A query whose items need their voxels together, because it cannot compare parts of an answer
+exactly (sweep) or collects one item at a time (contacts), holds all voxels of as many whole items as
+fit.
 
 A voxel that cannot be read, that comes too late, or that the budget does not wait for is MISSING: the
 search bounds it by its box. Loads that came too late are owed (residency).
 """
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec import structs
@@ -31,109 +27,27 @@ from numpy.typing import NDArray
 from ...schemas.wire.answers import Cost
 from ...schemas.wire.question_rules import Question
 from ..kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from ..residency.voxel_cache import HeldVoxels, VoxelCache
+from ..residency.voxel_cache import VoxelCache
 from ..runtime.stop_flag import StoppedError
-from .query_inputs import QueryBudget, SceneData
+from .query_inputs import CostCounter, QueryBudget, SceneData
 
-_A = TypeVar("_A")
-_C = TypeVar("_C", bound=Cost)
-_P = ParamSpec("_P")
-# Share of the cache that a round holds at once: the rest stays with the voxels kept for users.
+_A = TypeVar("_A", bound=Cost)
+# Share of the cache that a slice holds at once: the rest stays with the voxels kept for users.
 SHARE = 0.5
 # Limit of the points of an avatar in `search_resident`: 20 µs for the 3,617 points of the walk. Larger
 # avatars could block other requests, and gain little.
 MAX_FAST_POINTS = 1 << 13
 
-# What a query is: it yields between two slices of its work, and returns its answers.
-Steps = Generator[None, None, _A]
 # search(lists, which, cursor, state): examine voxels of the items numbered in `which`, each from its
 # entry `cursor` of the lists on, while `state` (v,) uint8 says HELD or MISSING. Move the cursors; an
 # item is finished at the end of its list.
 Search = Callable[[VoxelLists, NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]], None]
 # settle(lists): settle what can be settled without the voxels of `lists`, which are absent; return
 # what is left of the lists.
-Settle = Callable[[VoxelLists], Steps[VoxelLists]]
+Settle = Callable[[VoxelLists], VoxelLists]
 
 
-def run(steps: Steps[_A]) -> _A:
-    """Run a query through and return its answers."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as ended:
-            answers: _A = ended.value
-            return answers
-
-
-def answered(steps: Callable[_P, Steps[_A]]) -> Callable[_P, _A]:
-    """Return the function that runs the query through whose steps this generator is."""
-
-    @wraps(steps)
-    def answer(*args: _P.args, **kwargs: _P.kwargs) -> _A:
-        return run(steps(*args, **kwargs))
-
-    answer.__name__ = steps.__name__.removesuffix("_steps")
-    return answer
-
-
-class CostCounter:
-    """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
-
-    __slots__ = (
-        "_begin",
-        "_keys",
-        "_residency",
-        "faults",
-        "hits",
-        "late",
-        "loaded",
-        "misses",
-        "wait_seconds",
-    )
-
-    def __init__(self, data: SceneData) -> None:
-        """Begin now with zero cost. data: of the scene that is queried."""
-        self._begin, self._residency, self._keys = time.perf_counter(), data.residency, data.keys
-        self.hits = self.misses = 0
-        self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
-        self.wait_seconds = 0.0
-        self.faults: dict[str, None] = {}
-        self.late: dict[int, None] = {}
-
-    def add(self, held: HeldVoxels, again: int = 0) -> None:
-        """Add a hold. again: number of its hits on voxels that the request has held before."""
-        found = held.hits - again - self.loaded
-        self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
-        self.misses += held.misses
-        self.wait_seconds += held.waited
-        self.faults.update(dict.fromkeys(held.faults))
-        self.late.update(dict.fromkeys(held.late))
-
-    def add_cost(self, cost: Cost) -> None:
-        """Add the cost of another query of the same data."""
-        rows = [int(self._keys.searchsorted(key)) for key in cost.late]
-        self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
-
-    def add_level(self, cost: "CostCounter | Cost") -> None:
-        """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
-        self.wait_seconds += cost.wait_seconds
-        self.faults.update(dict.fromkeys(cost.faults))
-
-    def fields(self) -> dict[str, Any]:
-        """Return the fields of `Cost`; call it when the answer is complete."""
-        return {
-            "engine_seconds": time.perf_counter() - self._begin,
-            "hits": self.hits,
-            "misses": self.misses,
-            "resident": self._residency.resident,
-            "resident_bytes": self._residency.resident_bytes,
-            "faults": tuple(self.faults),
-            "wait_seconds": self.wait_seconds,
-            "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
-        }
-
-
-def ask_until_stopped(question: Question[_C], k: int, budget: QueryBudget, ask: Callable[[], _C]) -> _C:
+def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: Callable[[], _A]) -> _A:
     """Run a query of k items with `ask`. Add the reason to the answer if the request is stopped."""
     try:
         answers = ask()
@@ -142,7 +56,7 @@ def ask_until_stopped(question: Question[_C], k: int, budget: QueryBudget, ask: 
     return structs.replace(answers, stopped=budget.stopped) if budget.stopped else answers
 
 
-def unknown_answers(question: Question[_C], k: int, budget: QueryBudget) -> _C:
+def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
     """Return `Question.unknown` for the k items of a stopped request, with the reason."""
     answers = question.unknown(k, bounded=budget.tolerance > 0.0)
     return structs.replace(answers, stopped=budget.stopped)
@@ -203,7 +117,7 @@ def resolve(
     settle: Settle | None = None,
     *,
     together: bool = False,
-) -> Steps[NDArray[np.float64]]:
+) -> NDArray[np.float64]:
     """Search the voxels in reach of k items; add the cost to `spent`.
 
     settle: asked about the voxels that are absent, unless the request was stopped before; None: load
@@ -214,18 +128,18 @@ def resolve(
     """
     absent = data.arrays.where[lists.rows[: lists.starts[-1]], 0] < 0
     if settle is not None and absent.any() and together and not budget.stop:
-        cold = yield from settle(drop_entries(lists, ~absent))
+        cold = settle(drop_entries(lists, ~absent))
         settled = np.diff(cold.starts) == 0
         lists = drop_entries(lists, absent & settled[items_of(lists)])
     if settle is None or not absent.any() or together:
-        return (yield from load_and_search(data, lists, search, budget, spent, together=together))
-    left = yield from load_and_search(data, drop_entries(lists, absent), search, budget, spent)
+        return load_and_search(data, lists, search, budget, spent, together=together)
+    left = load_and_search(data, drop_entries(lists, absent), search, budget, spent)
     lists = drop_entries(lists, ~absent)
     if not budget.stop:  # all that is resident has been searched
-        lists = yield from settle(lists)
+        lists = settle(lists)
     if not lists.starts[-1]:
         return left
-    return np.minimum(left, (yield from load_and_search(data, lists, search, budget, spent)))
+    return np.minimum(left, load_and_search(data, lists, search, budget, spent))
 
 
 def load_and_search(
@@ -236,7 +150,7 @@ def load_and_search(
     spent: CostCounter,
     *,
     together: bool = False,
-) -> Steps[NDArray[np.float64]]:
+) -> NDArray[np.float64]:
     """Load the voxels of lists, nearest first and as far as the search needs them; return as `resolve`."""
     residency, where = data.residency, data.arrays.where
     cursor, ends = lists.starts[:-1].copy(), lists.starts[1:]
@@ -257,7 +171,6 @@ def load_and_search(
             search(lists, open_, cursor, state)
         spent.add(held, int(looked[rows].sum()))
         state[rows], looked[rows], first = NOT_HELD, True, False
-        yield
     left = np.full(len(cursor), np.inf)
     open_ = np.flatnonzero(cursor < ends)
     left[open_] = lists.near[cursor[open_]]
@@ -265,11 +178,11 @@ def load_and_search(
 
 
 def _next_rows(data: SceneData, ahead: NDArray[np.int64], needed: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the distinct voxels to hold in the next round, at least one.
+    """Return the distinct voxels to hold in the next slice, at least one.
 
     First come those `ahead`, the next ones of the open items, in the order of the items, then
     resident ones of those that some item still needs. Those that do not fit in the cache together
-    are left for another round.
+    are left for another slice.
     """
     where = data.arrays.where
     later: NDArray[np.bool_] = np.zeros(len(where), bool)

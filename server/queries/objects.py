@@ -18,8 +18,16 @@ from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..runtime.stop_flag import NO_STOP, StoppedError
 from .collide import collide_fast
-from .load_and_search import CostCounter
-from .query_inputs import EXACT, QueryBudget, SceneData, check_avatar, kernel_poses, to_units, with_stop
+from .query_inputs import (
+    EXACT,
+    CostCounter,
+    QueryBudget,
+    SceneData,
+    check_avatar,
+    kernel_poses,
+    to_units,
+    with_stop,
+)
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31

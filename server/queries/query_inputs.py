@@ -1,4 +1,4 @@
-"""Inputs of every query: the data of a scene, the budget of a request, and the checks of its poses.
+"""Inputs of every query: the data of a scene, the budget and the cost of a request, its checked poses.
 
 Every query takes a `SceneData` and a `QueryBudget`. Without a deadline the work ends when the answer is
 exact, or known within the tolerance. A deadline is a stop flag that is set at that time: the same
@@ -7,7 +7,7 @@ kernels end, and the answer is still correct. See NUMERICS.md case 30.
 
 import math
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,7 @@ from ...schemas.archive.rigid_pose import RENORMALISE
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from ...schemas.wire.answers import Cost
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core import voxels_in_reach as pose_checks
 from ..kernels.core.array_references import SceneReferences
@@ -26,7 +27,7 @@ from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.reach import VoxelTree, make_voxel_tree
 from ..kernels.core.scene_arrays import SceneArrays, block_words
 from ..kernels.core.voxels_in_reach import VoxelsInReach, check_poses, find_reach, make_reach
-from ..residency.voxel_cache import VoxelCache
+from ..residency.voxel_cache import HeldVoxels, VoxelCache
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
 
 # Share of the remaining time that loads may take; the rest is for searching resident voxels.
@@ -293,6 +294,63 @@ def make_budget(
     return budget
 
 
+class CostCounter:
+    """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
+
+    __slots__ = (
+        "_begin",
+        "_keys",
+        "_residency",
+        "faults",
+        "hits",
+        "late",
+        "loaded",
+        "misses",
+        "wait_seconds",
+    )
+
+    def __init__(self, data: SceneData) -> None:
+        """Begin now with zero cost. data: of the scene that is queried."""
+        self._begin, self._residency, self._keys = time.perf_counter(), data.residency, data.keys
+        self.hits = self.misses = 0
+        self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
+        self.wait_seconds = 0.0
+        self.faults: dict[str, None] = {}
+        self.late: dict[int, None] = {}
+
+    def add(self, held: HeldVoxels, again: int = 0) -> None:
+        """Add a hold. again: number of its hits on voxels that the request has held before."""
+        found = held.hits - again - self.loaded
+        self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
+        self.misses += held.misses
+        self.wait_seconds += held.waited
+        self.faults.update(dict.fromkeys(held.faults))
+        self.late.update(dict.fromkeys(held.late))
+
+    def add_cost(self, cost: Cost) -> None:
+        """Add the cost of another query of the same data."""
+        rows = [int(self._keys.searchsorted(key)) for key in cost.late]
+        self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
+
+    def add_level(self, cost: "CostCounter | Cost") -> None:
+        """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
+        self.wait_seconds += cost.wait_seconds
+        self.faults.update(dict.fromkeys(cost.faults))
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of `Cost`; call it when the answer is complete."""
+        return {
+            "engine_seconds": time.perf_counter() - self._begin,
+            "hits": self.hits,
+            "misses": self.misses,
+            "resident": self._residency.resident,
+            "resident_bytes": self._residency.resident_bytes,
+            "faults": tuple(self.faults),
+            "wait_seconds": self.wait_seconds,
+            "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
+        }
+
+
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
     """Return poses, (4, 4) or (k, 4, 4), in a writable array (k, 4, 4). Raise BadRequestError.
 
@@ -355,9 +413,45 @@ def check_request(
             )
 
 
-def unseen_from(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
-    """Return lower bounds (k,) of the distance of centres from scans that the build left out [steps].
+class PoseQuery(NamedTuple):
+    """Query about k poses of an avatar, whose arguments are checked.
 
-    inf: no such scan is in reach. Call it after all loads: one may have proved the index wrong.
+    poses: (k, 4, 4) float64, C order.  beyond: margin or reach, exact units.  around: the voxels in
+    reach of each pose.  spent: the cost so far.
     """
-    return np.zeros(len(reach.units)) if data.nothing_clear else reach.lists.unseen
+
+    data: SceneData
+    avatar: AvatarModel
+    poses: NDArray[np.float64]
+    beyond: int
+    around: VoxelsInReach
+    budget: QueryBudget
+    spent: CostCounter
+
+    @property
+    def radii(self) -> NDArray[np.int64]:
+        """Return the sum (k,) of the largest radii of avatar and scan, exact units."""
+        return self.around.units - self.beyond
+
+    @property
+    def unseen(self) -> NDArray[np.float64]:
+        """Return lower bounds (k,) of the distance of centres from scans that the build left out [steps].
+
+        inf: no such scan is in reach. Read it after all loads: one may have proved the index wrong.
+        """
+        if self.data.nothing_clear and len(self.avatar.points):
+            return np.zeros(len(self.poses))
+        return self.around.lists.unseen
+
+
+def make_query(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, beyond: int, budget: QueryBudget
+) -> PoseQuery:
+    """Check a query about poses, and list the voxels in their reach; raise as `check_request`.
+
+    beyond: margin or reach, exact units.
+    """
+    spent, array = CostCounter(data), kernel_poses(poses)
+    around = check_request(data, avatar, array, data.radius_units + beyond)
+    # Only from here on a deadline ends the kernels.
+    return PoseQuery(with_stop(data, budget.stop), avatar, array, beyond, around, budget, spent)

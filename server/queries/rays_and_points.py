@@ -1,8 +1,7 @@
 """Queries `raycast` and `within`: the first sphere that a ray hits, the scan point nearest to a point."""
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +14,8 @@ from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.reach import Items, VoxelLists, find_lists
 from ..kernels.rays.hits import ClosestHits, HitBatch, search_hits
-from .load_and_search import CostCounter, Steps, drop_items, resolve, run
-from .query_inputs import EXACT, QueryBudget, SceneData, to_units, with_stop
+from .load_and_search import drop_items, resolve
+from .query_inputs import EXACT, CostCounter, QueryBudget, SceneData, to_units, with_stop
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
@@ -42,13 +41,6 @@ def make_directions(values: ArrayLike) -> NDArray[np.float64]:
 def raycast(
     data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> RaycastAnswers:
-    """Answer `raycast`; see `raycast_steps`."""
-    return run(raycast_steps(data, origins, directions, reach, budget))
-
-
-def raycast_steps(
-    data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, budget: QueryBudget
-) -> Steps[RaycastAnswers]:
     """Find the first sphere of the scan that each ray hits; the radius model gives each radius.
 
     origins: (k, 3) float64, world [m].  directions: (k, 3), of any length except zero.
@@ -69,38 +61,22 @@ def raycast_steps(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-    hit: NDArray[np.float64] = np.full((len(world), 3), math.nan)
-    normal: NDArray[np.float64] = np.full((len(world), 3), math.nan)
-
-    def on_hits(which: NDArray[np.int64], best: ClosestHits) -> None:
-        """Write origin + distance u, and the normal along t u - d, from the sphere's centre to the hit.
-
-        It is opposite to the ray if these coincide.
-        """
-        t, u = best.value[:, None], unit[which]
-        hit[which] = world[which] + (t / UNITS_PER_METRE) * u
-        d = np.rint(best.lattice * data.arrays.units_per_step).astype(np.int64) - units[which]
-        away = t * u - d
-        length = np.sqrt((away * away).sum(axis=1))[:, None]
-        normal[which] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
-
     outside = leaves_scene(data, units.astype(np.float64), units + float(reach_units) * unit)
-    rays = HitBatch(units, unit, reach_units, data.radius_units)
-    hits = yield from find_hits(data, rays, budget, spent, on_hits)
-    return RaycastAnswers(
-        hits.verdict, hits.distance, hits.lower, hits.distance.copy(), hits.exact, hit, hits.cloud, normal, outside,
-        *hits.counts, **spent.fields(),
-    )  # fmt: skip
+    best = find_hits(data, HitBatch(units, unit, reach_units, data.radius_units), budget, spent)
+    hit, normal = np.full((2, len(world), 3), math.nan)
+    which = np.flatnonzero(np.isfinite(best.value))
+    t, u = best.value[which, None], unit[which]
+    hit[which] = world[which] + (t / UNITS_PER_METRE) * u
+    # The normal is along t u - d, from the sphere's centre to the hit; if these coincide, opposite to the ray.
+    d = np.rint(best.lattice[which] * data.arrays.units_per_step).astype(np.int64) - units[which]
+    away = t * u - d
+    length = np.sqrt((away * away).sum(axis=1))[:, None]
+    normal[which] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
+    columns = _columns(data, best, reach_units)
+    return RaycastAnswers(hit=hit, normal=normal, outside=outside, **columns, **spent.fields())
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT) -> WithinAnswers:
-    """Answer `within`; see `within_steps`."""
-    return run(within_steps(data, points, reach, budget))
-
-
-def within_steps(
-    data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
-) -> Steps[WithinAnswers]:
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
@@ -114,28 +90,8 @@ def within_steps(
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
     outside = leaves_scene(data, units - reach_units, units + reach_units)
-    hits = yield from find_hits(data, HitBatch(units, np.empty((0, 3)), reach_units, 0), budget, spent)
-    return WithinAnswers(
-        hits.verdict, hits.distance, hits.lower, hits.distance.copy(), hits.exact, hits.cloud, outside,
-        *hits.counts, **spent.fields(),
-    )  # fmt: skip
-
-
-class Hits(NamedTuple):
-    """Answers about k rays or points.
-
-    verdict: (k,) uint8. A hit remains a hit, whatever is missing.  distance: (k,) of the hit [m]; inf
-    for none.  lower: (k,) of what may be there [m].  exact: (k,) bool, whether everything missing
-    is farther away.  cloud: (k, 3) the scan point hit, world [m]; NaN for none.
-    counts: (3, k) uint32, voxels missing, node visits, point tests.
-    """
-
-    verdict: NDArray[np.uint8]
-    distance: NDArray[np.float64]
-    lower: NDArray[np.float64]
-    exact: NDArray[np.bool_]
-    cloud: NDArray[np.float64]
-    counts: NDArray[np.uint32]
+    best = find_hits(data, HitBatch(units, np.empty((0, 3)), reach_units, 0), budget, spent)
+    return WithinAnswers(outside=outside, **_columns(data, best, reach_units), **spent.fields())
 
 
 def make_origins(
@@ -161,45 +117,47 @@ def leaves_scene(data: SceneData, *places: NDArray[Any]) -> NDArray[np.bool_]:
     return outside
 
 
-def find_hits(
-    data: SceneData,
-    items: HitBatch,
-    budget: QueryBudget,
-    spent: CostCounter,
-    on_hits: Callable[[NDArray[np.int64], ClosestHits], None] = lambda which, best: None,
-) -> Steps[Hits]:
+def find_hits(data: SceneData, items: HitBatch, budget: QueryBudget, spent: CostCounter) -> ClosestHits:
     """Find the first hits of k rays or the points nearest to k points, a batch at a time.
 
-    on_hits: called with the numbers (n,) of items that hit something, and their results.
-    Add the cost to `spent`. Once the request is stopped, no further batch is begun, and nothing is
-    known about its items.
+    Add the cost to `spent`. Once the request is stopped, no further batch is begun: nothing is known
+    about its items, whose `unseen` is 0.
     """
-    k, arrays = len(items.origin), with_stop(data, budget.stop).arrays
-    hits = Hits(
-        np.full(k, Verdict.UNKNOWN, np.uint8), np.full(k, math.inf), np.zeros(k), np.zeros(k, bool),
-        np.full((k, 3), math.nan), np.zeros((3, k), np.uint32),
-    )  # fmt: skip
-    for begin in range(0, k, BATCH):
-        if begin and budget.stop:
-            break
+    k, found = len(items.origin), []
+    for begin in range(0, max(k, 1), BATCH):
         rows = slice(begin, begin + BATCH)
         batch = items._replace(origin=items.origin[rows], direction=items.direction[rows])
-        best = yield from _search_batch(data, batch, arrays, budget, spent)
-        value, missing = best.value, np.where(best.unseen > items.reach, math.inf, best.unseen)
-        hit = np.isfinite(value)
-        exact = np.where(hit, value < missing, np.isinf(missing))
-        hits.verdict[rows] = np.where(hit, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))
-        hits.distance[rows], hits.exact[rows] = value / UNITS_PER_METRE, exact
-        lower = np.where(exact & ~hit, float(items.reach), np.minimum(value, missing))
-        hits.lower[rows], hits.counts[:, rows] = lower / UNITS_PER_METRE, best.counts
-        which = np.flatnonzero(hit)
-        found = best._replace(value=value[which], lattice=best.lattice[which])
-        hits.cloud[begin + which] = found.lattice * data.arrays.step + data.arrays.origin
-        on_hits(begin + which, found)
+        best = no_hits(len(batch.origin))
+        if begin and budget.stop:
+            best.unseen[:] = 0.0
+        else:
+            _search_batch(data, batch, budget, spent, best)
+        found.append(best)
+    values, squares, lattice, unseen, counts = zip(*found, strict=True)
+    return ClosestHits(
+        np.concatenate(values), np.concatenate(squares), np.concatenate(lattice), np.concatenate(unseen),
+        np.concatenate(counts, axis=1),
+    )  # fmt: skip
+
+
+def _columns(data: SceneData, best: ClosestHits, reach_units: int) -> dict[str, Any]:
+    """Return the columns that the answers about rays and about points have in common.
+
+    A hit remains a hit, whatever is missing; it is exact if everything missing is farther away.
+    """
+    value, reach = best.value, float(reach_units)
+    hit, missing = np.isfinite(value), np.where(best.unseen > reach, math.inf, best.unseen)
     if data.nothing_clear:  # a load may have proved the index wrong
-        hits.verdict[hits.verdict == Verdict.CLEAR] = Verdict.UNKNOWN
-        hits.lower[:], hits.exact[:] = 0.0, False
-    return hits
+        missing[:] = 0.0
+    exact = np.where(hit, value < missing, np.isinf(missing))
+    clear = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
+    cloud = np.where(hit[:, None], best.lattice * data.arrays.step + data.arrays.origin, math.nan)
+    lower = np.where(exact & ~hit, reach, np.minimum(value, missing))
+    return {
+        "verdict": np.where(hit, Verdict.CONTACT, clear).astype(np.uint8), "distance": value / UNITS_PER_METRE,
+        "lower": lower / UNITS_PER_METRE, "upper": value / UNITS_PER_METRE, "exact": exact, "cloud_point": cloud,
+        "voxels_missing": best.counts[0], "node_visits": best.counts[1], "point_tests": best.counts[2],
+    }  # fmt: skip
 
 
 def no_hits(k: int) -> ClosestHits:
@@ -211,26 +169,24 @@ def no_hits(k: int) -> ClosestHits:
 
 
 def _search_batch(
-    data: SceneData, batch: HitBatch, arrays: Any, budget: QueryBudget, spent: CostCounter
-) -> Steps[ClosestHits]:
-    """Return the results of a batch; `unseen` bounds what was not examined."""
-    k, per_step, lists = len(batch.origin), data.arrays.units_per_step, _list(data, batch)
-    best = no_hits(k)
+    data: SceneData, batch: HitBatch, budget: QueryBudget, spent: CostCounter, best: ClosestHits
+) -> None:
+    """Write the results of a batch into `best`; `unseen` bounds what was not examined."""
+    per_step, lists = data.arrays.units_per_step, _list(data, batch)
+    arrays = with_stop(data, budget.stop).arrays
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         search_hits(batch, lists, *state, arrays, best)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         """Drop the rays that hit something before their next voxel."""
-        ahead = np.full(k, math.inf)
+        ahead = np.full(len(best.value), math.inf)
         open_ = np.flatnonzero(np.diff(lists.starts))
         ahead[open_] = lists.near[lists.starts[:-1][open_]] * per_step
         return drop_items(lists, ahead > best.value)
-        yield  # it is a generator
 
-    left = yield from resolve(data, lists, search, budget, spent, settle)
+    left = resolve(data, lists, search, budget, spent, settle)
     np.minimum(best.unseen, np.minimum(lists.unseen, left) * per_step, out=best.unseen)
-    return best
 
 
 def _list(data: SceneData, batch: HitBatch) -> VoxelLists:

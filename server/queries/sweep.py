@@ -4,10 +4,8 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
-from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
@@ -26,9 +24,6 @@ from ..runtime.stop_flag import StoppedError
 from .level_of_detail import below, find_level, level_budget
 from .load_and_search import (
     MAX_FAST_POINTS,
-    CostCounter,
-    Steps,
-    answered,
     cost_of_one,
     drop_items,
     resolve,
@@ -36,6 +31,7 @@ from .load_and_search import (
 )
 from .query_inputs import (
     EXACT,
+    CostCounter,
     LevelOfDetail,
     QueryBudget,
     SceneData,
@@ -51,6 +47,18 @@ DEFAULT_TOLERANCE = 1e-6
 # on less than covers.
 _LEVEL_SHARE, _LEVEL_LEAST = 0.25, 1e-4
 _SWEPT = record_type(*SWEPT)
+
+
+class LevelPart(NamedTuple):
+    """Part of k motions, and voxels, about which a level is asked.
+
+    rows: voxels of the scene that the level divides.  at, end: (k,) fractions.
+    """
+
+    level: LevelOfDetail
+    rows: NDArray[np.int64]
+    at: NDArray[np.float64]
+    end: NDArray[np.float64]
 
 
 def _from_origin(
@@ -70,28 +78,33 @@ def _from_origin(
 
 
 def _answers(
-    progress: SweepProgress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    speed: NDArray[np.float64],
+    witness_avatar: NDArray[np.float64],
+    witness_cloud: NDArray[np.float64],
+    counts: NDArray[np.uint32],
+    outside: NDArray[np.bool_],
     tolerance: float,
-) -> SweepAnswers:  # fmt: skip
-    """Make the answers from the progress of each motion.
+    cost: dict[str, Any],
+) -> SweepAnswers:
+    """Make the answers about k motions.
 
-    frozen: (k,) fraction up to which the motion is proved clear.
+    lower: (k,) fraction up to which a motion is proved clear.  upper, speed: as in `SweepProgress`.
+    counts: (4, k) voxels missing, node visits, point tests, steps.
     """
-    touches = progress.upper < np.inf
-    verdict = np.full(len(frozen), Verdict.UNKNOWN, np.uint8)
-    verdict[touches] = Verdict.CONTACT
-    verdict[~touches & (frozen >= 1.0)] = Verdict.CLEAR
-    with np.errstate(invalid="ignore"):
-        moved = progress.speed * (progress.upper - frozen)
-    exact = (verdict == Verdict.CLEAR) | (touches & ((moved <= tolerance) | (progress.upper == frozen)))
+    touches, clear = upper < np.inf, lower >= 1.0
+    moved = speed * (np.where(touches, upper, lower) - lower)
+    verdict = np.where(touches, Verdict.CONTACT, np.where(clear, Verdict.CLEAR, Verdict.UNKNOWN))
     return SweepAnswers(
-        verdict=verdict, lower=frozen, upper=progress.upper, exact=exact,
-        witness_avatar=progress.witness[:, 0].copy(), witness_cloud=progress.witness[:, 1].copy(),
-        steps=counts[3], outside=outside, voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2],
+        verdict=verdict.astype(np.uint8), lower=lower, upper=upper,
+        exact=np.where(touches, (moved <= tolerance) | (upper == lower), clear),
+        witness_avatar=witness_avatar, witness_cloud=witness_cloud, steps=counts[3], outside=outside,
+        voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2], **cost,
     )  # fmt: skip
 
 
-def sweep_steps(
+def sweep(
     data: SceneData,
     avatar: AvatarModel,
     pose_from: ArrayLike,
@@ -99,8 +112,8 @@ def sweep_steps(
     margin: float = 0.0,
     tolerance: float = 0.0,
     budget: QueryBudget = EXACT,
-    part: "LevelPart | None" = None,
-) -> Steps[SweepAnswers]:
+    part: LevelPart | None = None,
+) -> SweepAnswers:
     """Find the first contact of the avatar with the scene on the screw motion between two poses.
 
     kernels/motion/screw_motion.py defines the motion, in the dataset's frame: translations are
@@ -118,8 +131,7 @@ def sweep_steps(
     (`find_level`). Raise BadRequestError, BadTransformError, TooLargeError.
     """
     spent = CostCounter(data)
-    if not 0.0 <= tolerance <= MAX_COORDINATE:
-        raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
+    to_units(tolerance, "tolerance")  # it is a length
     tolerance = max(tolerance, budget.tolerance)
     first, last = kernel_poses(pose_from), kernel_poses(pose_to)
     if len(first) != len(last):
@@ -135,46 +147,47 @@ def sweep_steps(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
         np.zeros(k), np.zeros(k),
     )  # fmt: skip
-    counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
-    proved = np.ones(k)
-    if not len(avatar.points) or not k:
-        return _answers(progress, proved, counts, outside, tolerance)
-    box, scratch = avatar.box, make_scratch(avatar.arrays)
+    counts, outside, proved = np.zeros((4, k), np.uint32), np.zeros(k, bool), np.ones(k)
+    which = np.arange(k if len(avatar.points) else 0)
+    motions, scratch = (avatar.box, first, last, avatar.arrays, units), make_scratch(avatar.arrays)
     # The default tolerance is the rounding of an interval: such a sweep is an exact request.
     level = find_level(data, budget if tolerance > DEFAULT_TOLERANCE else budget._replace(tolerance=0.0))
     settled: NDArray[np.bool_] = np.zeros(k, bool)
-
     arrays = with_stop(data, budget.stop).arrays
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
-        advance_segments(
-            box, first, last, avatar.arrays, units, arrays, lists,
-            *state, tolerance, scratch, progress, counts,
-        )  # fmt: skip
+        advance_segments(*motions, arrays, lists, *state, tolerance, scratch, progress, counts)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
-        which = np.flatnonzero(np.diff(lists.starts))
+    def settle(lists: VoxelLists) -> VoxelLists:
+        """Drop the motions whose segments the level proves clear of the absent voxels."""
         if level is None:
             return lists
+        which = np.flatnonzero(np.diff(lists.starts))
         own = LevelPart(level, lists.rows[: lists.starts[-1]], progress.at[which], progress.end[which])
-        progress.floor[which] = yield from _clear_until(
-            own, avatar, world[0][which], world[1][which], margin, tolerance, budget, spent
-        )
+        within, progress.floor[which] = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST), 0.0
+        begins, ends = (poses[which] for poses in world)
+        try:
+            found = sweep(level.covers, avatar, begins, ends, margin, within, level_budget(budget), own)
+        except (BadRequestError, TooLargeError, StoppedError):  # cover spheres are larger than the scene's
+            return lists
+        spent.add_level(found)
+        if level.covers.nothing_clear:
+            return lists
+        progress.floor[which] = found.lower
         settled[which] = progress.floor[which] >= progress.end[which]
         return drop_items(lists, settled)
 
-    which = np.arange(k)
     if part is not None:
         progress.at[:] = part.at
     while len(which) and not budget.stop:
-        lists = _plan(data, avatar, box, first, last, units, which, progress)
+        lists = _plan(data, motions, which, progress)
         if lists is None:
             break
         if part is not None:
             lists = below(part.level, lists, part.rows)
         progress.lower[which] = progress.end[which]
         settled[:], missing = False, counts[0].copy()
-        left = yield from resolve(data, lists, search, budget, spent, settle, together=True)
+        left = resolve(data, lists, search, budget, spent, settle, together=True)
         # What else is near decides in which interval a contact is found: then the voxels that the
         # level settled are needed too, because the answer must not depend on what was in memory.
         again = settled & (left == np.inf) & ((progress.upper < np.inf) | (progress.lower < progress.end))
@@ -183,7 +196,7 @@ def sweep_steps(
             progress.lower[again], progress.upper[again] = progress.end[again], np.inf
             counts[0, again] = missing[again]
             lists = drop_items(lists, ~again)
-            left = np.minimum(left, (yield from resolve(data, lists, search, budget, spent, together=True)))
+            left = np.minimum(left, resolve(data, lists, search, budget, spent, together=True))
             lost = np.isinf(progress.upper) & (left < np.inf)  # stopped before it was found again
             progress.upper[lost] = found[lost]
         unfinished = left < np.inf
@@ -193,21 +206,18 @@ def sweep_steps(
             break
     # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
-    until = np.minimum(progress.upper, 1.0)
-    unknown = np.empty(k)
-    find_unknown_regions(
-        box, first, last, avatar.arrays, units, data.arrays, data.tree, until, outside, unknown
-    )
-    if data.nothing_clear:
-        unknown[:] = 0.0
-    met = unknown <= until
-    proved[met] = np.minimum(proved, unknown)[met]
-    progress.witness[:] += origin
-    answers = _answers(progress, proved, counts, outside, tolerance)
-    return structs.replace(answers, **spent.fields())
-
-
-sweep = answered(sweep_steps)
+    if len(avatar.points):
+        until, unknown = np.minimum(progress.upper, 1.0), np.empty(k)
+        find_unknown_regions(*motions, data.arrays, data.tree, until, outside, unknown)
+        if data.nothing_clear:
+            unknown[:] = 0.0
+        met = unknown <= until
+        proved[met] = np.minimum(proved, unknown)[met]
+    witness_avatar, witness_cloud = progress.witness[:, 0] + origin, progress.witness[:, 1] + origin
+    return _answers(
+        proved, progress.upper, progress.speed, witness_avatar, witness_cloud, counts, outside, tolerance,
+        spent.fields(),
+    )  # fmt: skip
 
 
 def sweep_fast(
@@ -231,88 +241,37 @@ def sweep_fast(
     ):
         return sweep(data, avatar, first, last, margin, tolerance, budget)
     result, outside = np.zeros(1, _SWEPT), np.zeros(1, bool)
+    result["avatar"] = result["cloud"] = np.nan  # without a contact they stay
     other_units = data.radius_units + to_units(margin, "margin")
     before = first[0], last[0], avatar.reference, make_scratch(avatar.arrays), other_units
     after = data.nothing_clear, float(most), result[0], outside
-    (needed, said, visits, tests, steps), _ = search_resident(
-        data, budget, sweep_one, before, after, examined=0
-    )
+    (needed, _, visits, tests, steps), _ = search_resident(data, budget, sweep_one, before, after, examined=0)
     if needed < 0:
         return sweep(data, avatar, first, last, margin, tolerance, budget)
-    lower, upper, touches = result["lower"], result["upper"], said == Verdict.CONTACT
-    exact = np.full(1, said == Verdict.CLEAR)
-    if touches:
-        exact = (result["speed"] * (upper - lower) <= most) | (upper == lower)
-    nothing: NDArray[np.float64] = np.full((1, 3), np.nan)
-    return SweepAnswers(
-        verdict=np.array([said], np.uint8), lower=lower, upper=upper, exact=exact,
-        witness_avatar=result["avatar"] if touches else nothing,
-        witness_cloud=result["cloud"] if touches else nothing.copy(), steps=np.array([steps], np.uint32),
-        outside=outside, voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
-        point_tests=np.array([tests], np.uint32), **cost_of_one(data, begin, needed),
+    counts = np.array([[0], [visits], [tests], [steps]], np.uint32)
+    cost = cost_of_one(data, begin, needed)
+    return _answers(
+        result["lower"], result["upper"], result["speed"], result["avatar"], result["cloud"], counts, outside,
+        most, cost,
     )  # fmt: skip
 
 
 def _plan(
-    data: SceneData,
-    avatar: AvatarModel,
-    box: NDArray[np.float64],
-    first: NDArray[np.float64],
-    last: NDArray[np.float64],
-    units: NDArray[np.int64],
-    which: NDArray[np.int64],
-    progress: SweepProgress,
+    data: SceneData, motions: tuple[Any, ...], which: NDArray[np.int64], progress: SweepProgress
 ) -> VoxelLists | None:
     """Plan the next segment of each motion in `which`, and list its voxels; None after a stop."""
-    k, capacity = len(first), 16 * len(which) + 64
+    k, capacity = len(progress.at), 16 * len(which) + 64
     space, moved = make_plan_space(), np.empty(len(which))
     while True:
         lists = VoxelLists(
             np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.full(k, np.inf)
         )
-        needed = plan_segments(
-            box, first, last, avatar.arrays, units, data.arrays, data.tree, which, progress, lists, space, moved
-        )  # fmt: skip
+        needed = plan_segments(*motions, data.arrays, data.tree, which, progress, lists, space, moved)
         if needed < 0:
             return None
         if needed <= capacity:
             return lists
         capacity = needed
-
-
-class LevelPart(NamedTuple):
-    """Part of k motions, and voxels, about which a level is asked.
-
-    rows: voxels of the scene that the level divides.  at, end: (k,) fractions.
-    """
-
-    level: LevelOfDetail
-    rows: NDArray[np.int64]
-    at: NDArray[np.float64]
-    end: NDArray[np.float64]
-
-
-def _clear_until(
-    part: LevelPart,
-    avatar: AvatarModel,
-    first: NDArray[np.float64],
-    last: NDArray[np.float64],
-    margin: float,
-    tolerance: float,
-    budget: QueryBudget,
-    spent: CostCounter,
-) -> Steps[NDArray[np.float64]]:
-    """Return the fraction (k,) up to which the level proves that motions, world, touch none of its voxels."""
-    covers = part.level.covers
-    within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
-    try:
-        found = yield from sweep_steps(
-            covers, avatar, first, last, margin, within, level_budget(budget), part
-        )
-    except (BadRequestError, TooLargeError, StoppedError):  # cover spheres are larger than those of the scene
-        return np.zeros(len(first))
-    spent.add_level(found)
-    return np.zeros(len(first)) if covers.nothing_clear else found.lower
 
 
 def _next_round(

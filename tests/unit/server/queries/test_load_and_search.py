@@ -9,15 +9,12 @@ from fake_store import BLOCK, FakeStore
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
 from solidcloud.server.queries.load_and_search import (
-    CostCounter,
-    Steps,
     drop_entries,
     drop_items,
     load_and_search,
     resolve,
-    run,
 )
-from solidcloud.server.queries.query_inputs import EXACT, LateVoxels, QueryBudget
+from solidcloud.server.queries.query_inputs import EXACT, CostCounter, LateVoxels, QueryBudget
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import StopFlag
 
@@ -72,6 +69,7 @@ class Table:
     ) -> None:
         """Examine what is held, as a kernel does."""
         self.calls.append((which.tolist(), np.flatnonzero(state == HELD).tolist()))
+        assert set(self.residency._pins) <= set(np.flatnonzero(state).tolist()), "of this slice alone"
         for item in which.tolist():
             while cursor[item] < lists.starts[item + 1]:
                 row = int(lists.rows[cursor[item]])
@@ -100,16 +98,10 @@ def test_every_voxel_of_every_item_is_searched_once_in_its_order(blocks: int, to
         table = Table([1, 2, 1, 2, 1, 1, 2, 1], blocks)
         items = [rng.permutation(8)[: rng.integers(0, 8)].tolist() for _ in range(6)]
         table.load(0, 2)
-        steps = load_and_search(
+        left = load_and_search(
             table.data, lists_of(items), table.search, EXACT, table.spent, together=together
         )
-        while True:
-            try:
-                next(steps)
-            except StopIteration as ended:
-                left = ended.value
-                break
-            assert not table.residency._pins, "nothing is held between two slices"
+        assert not table.residency._pins, "nothing is held at the end"
         assert [table.seen.get(i, []) for i in range(6)] == [[(row, HELD) for row in own] for own in items]
         assert (left == np.inf).all()
         distinct = {row for own in items for row in own}
@@ -127,7 +119,7 @@ def test_a_round_holds_the_next_voxel_of_each_item_and_what_is_resident() -> Non
     table = Table([1] * 6, 6)
     table.load(5)
     table.ends = {0: 0}
-    run(load_and_search(table.data, lists_of([[0, 1, 5], [2, 5, 3]]), table.search, EXACT, table.spent))
+    load_and_search(table.data, lists_of([[0, 1, 5], [2, 5, 3]]), table.search, EXACT, table.spent)
     assert table.calls == [([0, 1], [0, 2, 5]), ([1], [3])], "what no item needs any more is not held"
     assert table.rows_seen() == [[0], [2, 5, 3]]
     assert sorted(table.store.loads) == [0, 2, 3], "what is finished in its first voxel loads no second"
@@ -136,7 +128,7 @@ def test_a_round_holds_the_next_voxel_of_each_item_and_what_is_resident() -> Non
 def test_an_item_whose_voxels_do_not_fit_is_searched_in_parts() -> None:
     table = Table([1] * 5, 2)
     lists = lists_of([[0], [1, 2, 3], [4, 0]])
-    run(load_and_search(table.data, lists, table.search, EXACT, table.spent, together=True))
+    load_and_search(table.data, lists, table.search, EXACT, table.spent, together=True)
     assert table.rows_seen() == [[0], [1, 2, 3], [4, 0]]
     assert table.calls == [([0], [0]), ([1], [1, 2]), ([1], [3]), ([2], [0, 4])]
 
@@ -144,7 +136,7 @@ def test_an_item_whose_voxels_do_not_fit_is_searched_in_parts() -> None:
 def test_whole_items_share_a_round_as_far_as_they_fit() -> None:
     table = Table([1] * 6, 8)
     lists = lists_of([[0, 1], [1, 2], [3, 4], [4, 5]])
-    run(load_and_search(table.data, lists, table.search, EXACT, table.spent, together=True))
+    load_and_search(table.data, lists, table.search, EXACT, table.spent, together=True)
     assert table.calls == [([0, 1], [0, 1, 2, 3]), ([2, 3], [3, 4, 5])]
 
 
@@ -154,9 +146,7 @@ def test_a_stop_leaves_what_was_not_searched_and_loads_no_more(stop_at: int, tog
     table, items = Table([1] * 6, 2), [[0, 1], [2, 0, 3], [4]]
     table.stop_at = stop_at
     budget = QueryBudget(stop=table.stop)
-    left = run(
-        resolve(table.data, lists_of(items), table.search, budget, table.spent, None, together=together)
-    )
+    left = resolve(table.data, lists_of(items), table.search, budget, table.spent, None, together=together)
     assert sum(map(len, table.seen.values())) == stop_at
     for item, own in enumerate(items):
         done = len(table.seen.get(item, []))
@@ -169,9 +159,7 @@ def test_a_stop_leaves_what_was_not_searched_and_loads_no_more(stop_at: int, tog
 def test_a_request_that_was_stopped_before_loads_nothing() -> None:
     table = Table([1] * 2, 2)
     table.stop.set("")
-    left = run(
-        resolve(table.data, lists_of([[1], []]), table.search, QueryBudget(stop=table.stop), table.spent)
-    )
+    left = resolve(table.data, lists_of([[1], []]), table.search, QueryBudget(stop=table.stop), table.spent)
     assert left.tolist() == [0.5, np.inf] and not table.calls and not table.store.loads
 
 
@@ -181,7 +169,7 @@ def test_voxels_that_are_late_or_unreadable_are_missing(together: bool) -> None:
     table.store.faults[3] = "corrupt"
     table.load(1, 3)
     lists, late = lists_of([[0, 1], [1, 3], [2]]), QueryBudget(late=LateVoxels())
-    left = run(resolve(table.data, lists, table.search, late, table.spent, together=together))
+    left = resolve(table.data, lists, table.search, late, table.spent, together=together)
     assert table.seen == {0: [(0, MISSING), (1, HELD)], 1: [(1, HELD), (3, MISSING)], 2: [(2, MISSING)]}
     assert (left == np.inf).all() and not table.store.loads
     assert sorted(table.spent.late) == [0, 2] and len(table.spent.faults) == 1
@@ -201,7 +189,7 @@ def test_a_late_voxel_is_missing_although_another_thread_loads_it_now() -> None:
 
     table.residency.acquire = slow  # type: ignore[method-assign]
     late = QueryBudget(late=LateVoxels())
-    run(resolve(table.data, lists_of([[1]]), table.search, late, table.spent))
+    resolve(table.data, lists_of([[1]]), table.search, late, table.spent)
     assert table.residency.where[1, 0] >= 0
     assert table.seen == {0: [(1, MISSING)]}
 
@@ -212,19 +200,18 @@ def test_settle_is_asked_about_absent_voxels_alone(together: bool) -> None:
     table.load(1, 2)
     asked: list[list[list[int]]] = []
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         asked.append(rows_of(lists))
         assert not table.store.loads, "before any load"
         assert bool(table.seen) != together, "what is resident was searched before, unless voxels go together"
-        yield
         return drop_items(lists, np.array([True, False, False]))
 
     lists = lists_of([[0, 1, 3], [2, 4], [1, 2]])
-    left = run(resolve(table.data, lists, table.search, EXACT, table.spent, settle, together=together))
+    left = resolve(table.data, lists, table.search, EXACT, table.spent, settle, together=together)
     assert asked == [[[0, 3], [4], []]]
     assert table.rows_seen() == [[1], [2, 4], [1, 2]] and sorted(table.store.loads) == [4]
     assert (left == np.inf).all()
-    run(resolve(table.data, lists_of([[1, 2, 4]]), table.search, EXACT, table.spent, settle))
+    resolve(table.data, lists_of([[1, 2, 4]]), table.search, EXACT, table.spent, settle)
     assert len(asked) == 1, "all of them are resident"
 
 
@@ -237,12 +224,11 @@ def test_settle_is_not_asked_after_a_stop(together: bool) -> None:
     if together:
         table.stop.set("")
 
-    def settle(_: VoxelLists) -> Steps[VoxelLists]:
+    def settle(_: VoxelLists) -> VoxelLists:
         raise AssertionError("asked after a stop")
-        yield
 
     lists, budget = lists_of([[0, 1, 2], [3]]), QueryBudget(stop=table.stop)
-    left = run(resolve(table.data, lists, table.search, budget, table.spent, settle, together=together))
+    left = resolve(table.data, lists, table.search, budget, table.spent, settle, together=together)
     assert left.tolist() == [0.5 if together else 1.5, 0.5] and not table.store.loads
 
 

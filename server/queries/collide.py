@@ -17,7 +17,6 @@ from .load_and_search import (
     MAX_FAST_POINTS,
     Search,
     Settle,
-    cost_of_one,
     drop_items,
     resolve,
     search_resident,
@@ -90,7 +89,11 @@ def collide_fast(
     refuse(fault, 0, found)
     if needed < 0:
         return collide(data, avatar, array, margin, budget)
-    return CollideAnswers(verdict, outside, *counts, **cost_of_one(data, begin, needed))
+    residency = data.residency
+    return CollideAnswers(
+        verdict, outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
+        hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
+    )  # fmt: skip
 
 
 def _search(

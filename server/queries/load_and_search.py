@@ -16,7 +16,6 @@ A voxel that cannot be read, that comes too late, or that the budget does not wa
 search bounds it by its box. Loads that came too late are owed (residency).
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -94,18 +93,6 @@ def search_resident(
         if found[examined] > 0:
             residency.use(held.rows[: found[examined]].tolist(), scan=budget.scan)
     return found, outside
-
-
-def cost_of_one(data: SceneData, begin: float, hits: int) -> dict[str, Any]:
-    """Return the fields of `Cost` of a query that `search_resident` answered.
-
-    begin: on time.perf_counter()'s clock [s].  hits: the voxels examined.
-    """
-    residency = data.residency
-    return {
-        "engine_seconds": time.perf_counter() - begin, "hits": hits,
-        "resident": residency.resident, "resident_bytes": residency.resident_bytes,
-    }  # fmt: skip
 
 
 def resolve(

@@ -603,9 +603,6 @@ def _place_arrays(
         make_poses(each) if subject else make_vectors(each, name)
         for each, name in zip(given, names, strict=True)
     ]
-    if len(arrays[0]) != len(arrays[-1]):
-        one, other = ("poses to begin at", "to end at") if subject else (names[0], names[-1])
-        raise BadRequestError(f"{len(arrays[0])} {one} and {len(arrays[-1])} {other}: expected equal numbers")
 
     def place(archive: PlacedArchive, opened: ArchiveGeneration) -> PlacedItems:
         if subject:

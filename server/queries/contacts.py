@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.errors import BadRequestError, TooLargeError
+from ...schemas.errors import TooLargeError
 from ...schemas.wire.answers import ContactsAnswers, Verdict
 from ...schemas.wire.request_limits import MAX_CONTACTS
+from ...schemas.wire.requests import check_integer
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.contacts import contact_cells as cells
 from ..kernels.contacts.contact_cells import POSE, ContactOptions, ContactState, list_pose, make_cells
@@ -68,7 +69,8 @@ def contacts(
     The verdict is CONTACT if a pair was found; otherwise CLEAR, or UNKNOWN if not everything in
     reach was examined. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    limit, margin_units = _checked_limit(limit), to_units(margin, "margin")
+    check_integer("limit", limit, MAX_CONTACTS)
+    limit, margin_units = operator.index(limit), to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
     query = make_query(data, avatar, poses, margin_units, budget)
     edges = _edges(query.around, edge_units, data.arrays.units_per_step)
@@ -130,19 +132,6 @@ def _gather(
     settle = drop_clear_of(find_level(query.data, query.budget), query)
     left = resolve(query.data, query.around.lists, search, query.budget, query.spent, settle, together=True)
     return memory, tally, left
-
-
-def _checked_limit(limit: int) -> int:
-    """Return the number of pairs to list as an int. Raise BadRequestError."""
-    try:
-        number = operator.index(limit)
-    except TypeError:
-        number = -1
-    if isinstance(limit, bool) or not 0 <= number <= MAX_CONTACTS:
-        raise BadRequestError(
-            f"limit {limit!r}: expected a whole number of pairs a pose, 0 to {MAX_CONTACTS}"
-        )
-    return number
 
 
 def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:

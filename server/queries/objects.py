@@ -5,7 +5,7 @@ current pose.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,17 +50,6 @@ class CheckedObjects(NamedTuple):
     margin_units: int
 
 
-class ObjectContacts(NamedTuple):
-    """Contacts between objects; fields as in `ObjectsAnswers`."""
-
-    pairs: NDArray[np.int32]
-    pair_verdict: NDArray[np.uint8]
-    pairs_tested: int
-    pairs_filtered: int
-    pair_visits: int
-    pair_tests: int
-
-
 def objects(
     data: SceneData,
     avatars: Sequence[AvatarModel],
@@ -97,10 +86,9 @@ def objects(
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)
-    contacts = _touching_pairs(checked, data.arrays.origin, budget)
-    return ObjectsAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], *contacts, **spent.fields()
-    )  # fmt: skip
+    pairs = _touching_pairs(checked, data.arrays.origin, budget)
+    missing, visits, tests = counts
+    return ObjectsAnswers(verdict, outside, missing, visits, tests, **pairs, **spent.fields())
 
 
 def _check(
@@ -181,8 +169,8 @@ def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[ND
 
 def _touching_pairs(
     checked: CheckedObjects, origin: NDArray[np.float64], budget: QueryBudget
-) -> ObjectContacts:
-    """Test the pairs, those of the same two avatars in one kernel call."""
+) -> dict[str, Any]:
+    """Test the pairs, those of the same two avatars in one kernel call; return the fields of the answers."""
     pairs, filtered = find_pairs(checked, origin)
     kinds = checked.model_of[pairs]
     # Contact is symmetric, so two avatars are tested in one order only.
@@ -211,4 +199,7 @@ def _touching_pairs(
         tested += len(rows)
     listed = verdict != CLEAR
     visits, tests = counters.tolist()
-    return ObjectContacts(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)
+    return {
+        "pairs": pairs[listed].astype(np.int32), "pair_verdict": verdict[listed], "pairs_tested": tested,
+        "pairs_filtered": filtered, "pair_visits": visits, "pair_tests": tests,
+    }  # fmt: skip

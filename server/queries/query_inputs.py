@@ -20,6 +20,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ...schemas.wire.answers import Cost
+from ...schemas.wire.requests import check_duration, check_length
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core import voxels_in_reach as pose_checks
 from ..kernels.core.array_references import SceneReferences
@@ -278,17 +279,15 @@ def make_budget(
     budget_ms: time limit including waits for loads; None: no limit.
     stop: the request's stop flag; a time limit sets a part of it. Raise BadRequestError.
     """
-    if not 0 <= tolerance < math.inf:
-        raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
+    check_length("tolerance", tolerance)
     if not 0 <= relative_tolerance < math.inf:
         raise BadRequestError(
             f"relative_tolerance is {relative_tolerance}: expected a finite share, 0 or more, as 0.3 for 30 %"
         )
-    if budget_ms is not None and not 0 <= budget_ms < math.inf:
-        raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
     budget = QueryBudget(float(tolerance), stop=stop, relative=float(relative_tolerance), request=stop)
     if budget_ms is None:
         return budget
+    check_duration("budget_ms", budget_ms)
     budget = budget._replace(deadline=time.perf_counter() + budget_ms / 1e3, stop=stop.part())
     stop_at(budget.stop, budget.deadline, "")
     return budget
@@ -296,18 +295,6 @@ def make_budget(
 
 class CostCounter:
     """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
-
-    __slots__ = (
-        "_begin",
-        "_keys",
-        "_residency",
-        "faults",
-        "hits",
-        "late",
-        "loaded",
-        "misses",
-        "wait_seconds",
-    )
 
     def __init__(self, data: SceneData) -> None:
         """Begin now with zero cost. data: of the scene that is queried."""

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -400,7 +400,8 @@ class Scene(QueryMethods):
             try:
                 answers: _A = ENGINES[question.name](data, *subject, budget=budget)
             except StoppedError:
-                answers = unknown_answers(question, _count(question, rows), budget)
+                k = len(make_poses(rows)) if question.about_avatars else len(rows)
+                answers = unknown_answers(question, k, budget)
             else:
                 if budget.stopped:
                     answers = structs.replace(answers, stopped=budget.stopped)
@@ -628,10 +629,3 @@ def _terms(
     budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
     return with_stop(data, budget.request), budget
-
-
-def _count(question: Question[Any], rows: ArrayLike) -> int:
-    """Return the number of items of an argument; 0 for one that has no length."""
-    if question.about_avatars:
-        return len(make_poses(rows))
-    return len(rows) if isinstance(rows, Sized) else 0

@@ -5,6 +5,7 @@ current pose.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,11 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import ObjectsAnswers
+from ...schemas.wire.question_table import COLLIDE
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..runtime.stop_flag import NO_STOP, StoppedError
+from ..runtime.stop_flag import NO_STOP
 from .collide import collide_fast
+from .load_and_search import ask_until_stopped
 from .query_inputs import (
     EXACT,
     CostCounter,
@@ -78,11 +81,8 @@ def objects(
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
-        try:
-            found = collide_fast(data, model, checked.poses[rows], margin, budget)
-        except StoppedError:
-            verdict[rows] = UNKNOWN
-            continue
+        ask = partial(collide_fast, data, model, checked.poses[rows], margin, budget)
+        found = ask_until_stopped(COLLIDE, len(rows), budget, ask)
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)

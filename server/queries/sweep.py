@@ -61,22 +61,6 @@ class LevelPart(NamedTuple):
     end: NDArray[np.float64]
 
 
-def _from_origin(
-    data: SceneData, first: NDArray[np.float64], last: NDArray[np.float64]
-) -> tuple[SceneData, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Move scene and poses so that the dataset's origin is zero; return its world position too [m].
-
-    Intermediate poses are computed and rounded in this frame. A scene at map coordinates therefore
-    gives the same answers as at the origin, bit for bit (NUMERICS.md case 1), with intermediate
-    poses of the same precision. The end poses are t - O, see N5.
-    """
-    origin = data.arrays.origin
-    first, last = first.copy(), last.copy()
-    for poses in (first, last):
-        poses[:, :3, 3] -= origin
-    return data._replace(arrays=data.arrays._replace(origin=np.zeros(3))), first, last, origin
-
-
 def sweep(
     data: SceneData,
     avatar: AvatarModel,
@@ -115,7 +99,14 @@ def sweep(
     other_units = data.radius_units + to_units(margin, "margin")
     units = check_avatar(data, avatar, first, other_units)
     check_avatar(data, avatar, last, other_units)
-    data, first, last, origin = _from_origin(data, first, last)
+    # Intermediate poses are computed and rounded from the dataset's origin, where the end poses are t - O
+    # (N5): a scene at map coordinates gives the same answers as at the origin, bit for bit (NUMERICS.md
+    # case 1), with intermediate poses of the same precision.
+    origin = data.arrays.origin
+    data = data._replace(arrays=data.arrays._replace(origin=np.zeros(3)))
+    first, last = first.copy(), last.copy()
+    first[:, :3, 3] -= origin
+    last[:, :3, 3] -= origin
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
         np.zeros(k), np.zeros(k),

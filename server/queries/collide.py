@@ -14,12 +14,10 @@ from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.reach import VoxelLists
 from .level_of_detail import ask_level, below, find_level, search_level
 from .load_and_search import (
-    MAX_FAST_POINTS,
     Search,
     Settle,
     drop_items,
     resolve,
-    search_resident,
 )
 from .query_inputs import (
     EXACT,
@@ -33,6 +31,10 @@ from .query_inputs import (
     refuse,
     to_units,
 )
+
+# Limit of the points of an avatar in `search_resident`: 20 µs for the 3,617 points of the walk. Larger
+# avatars could block other requests, and gain little.
+MAX_FAST_POINTS = 1 << 13
 
 
 def collide(
@@ -70,6 +72,40 @@ def collide(
     missing, visits, tests = counts
     cost = query.spent.fields()
     return CollideAnswers(verdict, query.around.outside, missing, visits, tests, **cost, **bounds)
+
+
+def search_resident(
+    data: SceneData,
+    budget: QueryBudget,
+    kernel: Any,
+    before: tuple[Any, ...],
+    after: tuple[Any, ...],
+    examined: int = 2,
+) -> tuple[Any, NDArray[np.bool_]]:
+    """Answer a query of one item by a single kernel call, if resident voxels answer it.
+
+    The answers equal those of the slices bit for bit, cost counters included, except engine_seconds and
+    `hits`, the voxels that were examined instead of all in reach; with a tolerance, the distance is the
+    exact one. For `collide` and `distance`, resident voxels suffice if nothing in the others changes the
+    answer. Callers do not use it for avatars of more than MAX_FAST_POINTS points, nor, except `sweep`,
+    if a scan was left out of the archive or a load proved its index wrong.
+
+    The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
+    of the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits
+    keep it to some tens of microseconds.
+
+    kernel: takes `before`, a reference to the scene, the stop flag, and `after`.  examined: position in
+    the kernel's result of the number of voxels examined; negative: a voxel has to be loaded, too many are
+    in reach, or the request was stopped.
+    Return the kernel's result, and whether the reach of the pose leaves the scene (1,).
+    """
+    residency, held = data.residency, data.references.to(data.arrays, data.tree)
+    with residency.frozen():
+        found = held.call(kernel, *before, held.reference, budget.stop.flag, *after)
+        outside = held.outside.copy()
+        if found[examined] > 0:
+            residency.use(held.rows[: found[examined]].tolist(), scan=budget.scan)
+    return found, outside
 
 
 def collide_fast(

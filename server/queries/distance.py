@@ -36,8 +36,9 @@ from ..kernels.nearest.nearest_search import (
     nearest_resident,
     write_results,
 )
+from .collide import MAX_FAST_POINTS, search_resident
 from .level_of_detail import ask_level, below, find_level, search_level
-from .load_and_search import MAX_FAST_POINTS, Search, drop_items, resolve, search_resident
+from .load_and_search import Search, drop_items, resolve
 from .query_inputs import (
     EXACT,
     LevelOfDetail,

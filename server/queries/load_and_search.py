@@ -2,22 +2,21 @@
 
 Every query gets its voxels in this way. It lists the voxels in reach of each of its items (poses,
 points, rays, motions), nearest first (kernels/core/reach.py), and gives the search that examines
-them. One item whose voxels are resident takes a single kernel call, `search_resident`. Otherwise
-`resolve` first searches the voxels that are resident. What these leave open, the query may settle in
-another way, for example by the level of detail (level_of_detail.py). The rest is loaded:
+them. `resolve` first searches the voxels that are resident. What these leave open, the query may
+settle in another way, for example by the level of detail (level_of_detail.py). The rest is loaded:
 `load_and_search` repeats a slice until every item is finished. A slice holds the next voxel of each
 item, and all later ones that are resident, as many as fit in SHARE of the cache, and calls the
 search, which goes on where each item stopped. A hit in the first voxel therefore loads no second
 one. A query whose items need their voxels together, because it cannot compare parts of an answer
 exactly (sweep) or collects one item at a time (contacts), holds all voxels of as many whole items as
-fit.
+fit. One item whose voxels are all resident does without (`search_resident` in collide.py).
 
 A voxel that cannot be read, that comes too late, or that the budget does not wait for is MISSING: the
 search bounds it by its box. Loads that came too late are owed (residency).
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from msgspec import structs
@@ -33,9 +32,6 @@ from .query_inputs import CostCounter, QueryBudget, SceneData
 _A = TypeVar("_A", bound=Cost)
 # Share of the cache that a slice holds at once: the rest stays with the voxels kept for users.
 SHARE = 0.5
-# Limit of the points of an avatar in `search_resident`: 20 µs for the 3,617 points of the walk. Larger
-# avatars could block other requests, and gain little.
-MAX_FAST_POINTS = 1 << 13
 
 # search(lists, which, cursor, state): examine voxels of the items numbered in `which`, each from its
 # entry `cursor` of the lists on, while `state` (v,) uint8 says HELD or MISSING. Move the cursors; an
@@ -59,40 +55,6 @@ def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
     """Return `Question.unknown` for the k items of a stopped request, with the reason."""
     answers = question.unknown(k, bounded=budget.tolerance > 0.0)
     return structs.replace(answers, stopped=budget.stopped)
-
-
-def search_resident(
-    data: SceneData,
-    budget: QueryBudget,
-    kernel: Any,
-    before: tuple[Any, ...],
-    after: tuple[Any, ...],
-    examined: int = 2,
-) -> tuple[Any, NDArray[np.bool_]]:
-    """Answer a query of one item by a single kernel call, if resident voxels answer it.
-
-    The answers equal those of the slices bit for bit, cost counters included, except engine_seconds and
-    `hits`, the voxels that were examined instead of all in reach; with a tolerance, the distance is the
-    exact one. For `collide` and `distance`, resident voxels suffice if nothing in the others changes the
-    answer. Callers do not use it for avatars of more than MAX_FAST_POINTS points, nor, except `sweep`,
-    if a scan was left out of the archive or a load proved its index wrong.
-
-    The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
-    of the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits
-    keep it to some tens of microseconds.
-
-    kernel: takes `before`, a reference to the scene, the stop flag, and `after`.  examined: position in
-    the kernel's result of the number of voxels examined; negative: a voxel has to be loaded, too many are
-    in reach, or the request was stopped.
-    Return the kernel's result, and whether the reach of the pose leaves the scene (1,).
-    """
-    residency, held = data.residency, data.references.to(data.arrays, data.tree)
-    with residency.frozen():
-        found = held.call(kernel, *before, held.reference, budget.stop.flag, *after)
-        outside = held.outside.copy()
-        if found[examined] > 0:
-            residency.use(held.rows[: found[examined]].tolist(), scan=budget.scan)
-    return found, outside
 
 
 def resolve(

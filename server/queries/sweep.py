@@ -21,12 +21,11 @@ from ..kernels.motion.sweep_segments import (
     plan_segments,
 )
 from ..runtime.stop_flag import StoppedError
+from .collide import MAX_FAST_POINTS, search_resident
 from .level_of_detail import below, find_level, level_budget
 from .load_and_search import (
-    MAX_FAST_POINTS,
     drop_items,
     resolve,
-    search_resident,
 )
 from .query_inputs import (
     EXACT,

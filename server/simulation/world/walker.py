@@ -24,7 +24,7 @@ from ...kernels.motion.sweep_resident import make_scratch
 from ...kernels.walk import state
 from ...kernels.walk.slide import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
-from ...queries.load_and_search import MAX_FAST_POINTS
+from ...queries.collide import MAX_FAST_POINTS
 from ...queries.query_inputs import EXACT
 from .collision_world import SPARSE_FACTOR, World, normals_of
 from .frame import (

@@ -13,12 +13,7 @@ from ..kernels.collide.collide_poses import collide_poses, collide_resident
 from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.reach import VoxelLists
 from .level_of_detail import ask_level, below, find_level, search_level
-from .load_and_search import (
-    Search,
-    Settle,
-    drop_items,
-    resolve,
-)
+from .load_and_search import Search, Settle, drop_items, resolve
 from .query_inputs import (
     EXACT,
     LevelOfDetail,
@@ -102,9 +97,9 @@ def search_resident(
     residency, held = data.residency, data.references.to(data.arrays, data.tree)
     with residency.frozen():
         found = held.call(kernel, *before, held.reference, budget.stop.flag, *after)
-        outside = held.outside.copy()
-        if found[examined] > 0:
-            residency.use(held.rows[: found[examined]].tolist(), scan=budget.scan)
+        count, outside = found[examined], held.outside.copy()
+        if count > 0:
+            residency.use(held.rows[:count].tolist(), scan=budget.scan)
     return found, outside
 
 

@@ -38,7 +38,7 @@ from ..kernels.nearest.nearest_search import (
 )
 from .collide import MAX_FAST_POINTS, search_resident
 from .level_of_detail import ask_level, below, find_level, search_level
-from .load_and_search import Search, drop_items, resolve
+from .load_and_search import Search, drop_items, next_near, resolve
 from .query_inputs import (
     EXACT,
     LevelOfDetail,
@@ -176,10 +176,7 @@ def _search(query: PoseQuery, nearest: NearestPairs, counts: NDArray[np.uint32])
 
 def _drop_farther(data: SceneData, lists: VoxelLists, nearest: NearestPairs) -> VoxelLists:
     """Return lists without items whose next voxel is farther than the pair found."""
-    k = len(nearest.square)
-    held = np.flatnonzero(np.diff(lists.starts))
-    next_units = np.full(k, np.inf)
-    next_units[held] = lists.near[lists.starts[:-1][held]] * data.arrays.units_per_step
+    next_units = next_near(lists, lists.starts[:-1]) * data.arrays.units_per_step
     found = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64)) + 2.0 + nearest.deficit
     return drop_items(lists, (nearest.square >= 0) & (next_units > found))
 

@@ -120,10 +120,15 @@ def load_and_search(
             search(lists, open_, cursor, state)
         spent.add(held, int(looked[rows].sum()))
         state[rows], looked[rows], first = NOT_HELD, True, False
-    left = np.full(len(cursor), np.inf)
-    open_ = np.flatnonzero(cursor < ends)
-    left[open_] = lists.near[cursor[open_]]
-    return left
+    return next_near(lists, cursor)
+
+
+def next_near(lists: VoxelLists, cursor: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return `near` of each item's entry at `cursor` (k,) [steps]; inf at the end of its list."""
+    found = np.full(len(cursor), np.inf)
+    open_ = np.flatnonzero(cursor < lists.starts[1:])
+    found[open_] = lists.near[cursor[open_]]
+    return found
 
 
 def _next_rows(data: SceneData, ahead: NDArray[np.int64], needed: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.reach import Items, VoxelLists, find_lists
 from ..kernels.rays.hits import ClosestHits, HitBatch, search_hits
-from .load_and_search import drop_items, resolve
+from .load_and_search import drop_items, next_near, resolve
 from .query_inputs import EXACT, CostCounter, QueryBudget, SceneData, to_units, with_stop
 
 # Rays or points whose lists are in memory at a time.
@@ -180,10 +180,7 @@ def _search_batch(
 
     def settle(lists: VoxelLists) -> VoxelLists:
         """Drop the rays that hit something before their next voxel."""
-        ahead = np.full(len(best.value), math.inf)
-        open_ = np.flatnonzero(np.diff(lists.starts))
-        ahead[open_] = lists.near[lists.starts[:-1][open_]] * per_step
-        return drop_items(lists, ahead > best.value)
+        return drop_items(lists, next_near(lists, lists.starts[:-1]) * per_step > best.value)
 
     left = resolve(data, lists, search, budget, spent, settle)
     np.minimum(best.unseen, np.minimum(lists.unseen, left) * per_step, out=best.unseen)

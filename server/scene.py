@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence, Sized
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -42,17 +42,7 @@ from .avatars.avatar_model import AvatarModel, describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import Avatars, check_owner
 from .observability.request_stats import RequestStats
-from .queries.engine_table import ENGINES
-from .queries.objects import SCENE_GROUP
-from .queries.path import PATH_THREADS, largest_part, path_parts
-from .queries.request import EXACT, QueryBudget, make_budget, unknown_answers
-from .queries.scene_data import SceneData, with_stop
-from .residency.voxel_cache import VoxelCache
-from .residency.voxel_store import OpenStore, VoxelStore
-from .runtime.path_threads import PathThreads
-from .runtime.process_heap import give_back_freed_memory
-from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
-from .scene_archives import (
+from .open_scene_file import (
     FoundAvatar,
     error_location,
     find_archives,
@@ -60,6 +50,16 @@ from .scene_archives import (
     open_archives,
     read_avatars,
 )
+from .queries.engine_table import ENGINES
+from .queries.load_and_search import unknown_answers
+from .queries.objects import SCENE_GROUP
+from .queries.path import PATH_THREADS, largest_part, path_parts
+from .queries.query_inputs import EXACT, QueryBudget, SceneData, make_budget, with_stop
+from .residency.voxel_cache import VoxelCache
+from .residency.voxel_store import OpenStore, VoxelStore
+from .runtime.path_threads import PathThreads
+from .runtime.process_heap import give_back_freed_memory
+from .runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .scene_interface import AvatarLimits, AvatarShape, QueryMethods, list_avatars
 from .simulation.simulation import LocalSession, Simulation, make_simulation
 from .tiles.scene_overview import read_overview
@@ -364,7 +364,7 @@ class Scene(QueryMethods):
         options: the remaining fields by name, and
 
         - budget_ms, and tolerance [m] and relative_tolerance of questions that take them: see
-          server/queries/request.py,
+          server/queries/query_inputs.py,
         - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
           scene's default,
         - stop: stop flag that ends the work early.
@@ -399,7 +399,8 @@ class Scene(QueryMethods):
             try:
                 answers: _A = ENGINES[question.name](data, *subject, budget=budget)
             except StoppedError:
-                answers = unknown_answers(question, _count(question, rows), budget)
+                k = len(make_poses(rows)) if question.about_avatars else len(rows)
+                answers = unknown_answers(question, k, budget)
             else:
                 if budget.stopped:
                     answers = structs.replace(answers, stopped=budget.stopped)
@@ -602,9 +603,6 @@ def _place_arrays(
         make_poses(each) if subject else make_vectors(each, name)
         for each, name in zip(given, names, strict=True)
     ]
-    if len(arrays[0]) != len(arrays[-1]):
-        one, other = ("poses to begin at", "to end at") if subject else (names[0], names[-1])
-        raise BadRequestError(f"{len(arrays[0])} {one} and {len(arrays[-1])} {other}: expected equal numbers")
 
     def place(archive: PlacedArchive, opened: ArchiveGeneration) -> PlacedItems:
         if subject:
@@ -630,10 +628,3 @@ def _terms(
     budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
     return with_stop(data, budget.request), budget
-
-
-def _count(question: Question[Any], rows: ArrayLike) -> int:
-    """Return the number of items of an argument; 0 for one that has no length."""
-    if question.about_avatars:
-        return len(make_poses(rows))
-    return len(rows) if isinstance(rows, Sized) else 0

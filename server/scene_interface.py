@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from time import monotonic
-from typing import Any, NamedTuple, Protocol, Self, TypeVar, Unpack
+from typing import Any, NamedTuple, Protocol, TypeVar, Unpack
 
 import numpy as np
 from msgspec import structs
@@ -244,11 +244,6 @@ class LatestState(State, frozen=True, eq=False, kw_only=True):
 
     age: float
 
-    @classmethod
-    def of(cls, state: State, age: float) -> Self:
-        """Return a state with its age."""
-        return cls(**structs.asdict(state), age=age)
-
     def __repr__(self) -> str:
         """Return the state in one line, with its age."""
         return f"{State.__repr__(self)}, {self.age:.2g} s ago"
@@ -352,9 +347,9 @@ class Session:
         """
         with self._changed:
             self._raise_error()
-            return (
-                None if self._latest is None else LatestState.of(self._latest, monotonic() - self._received)
-            )
+            if self._latest is None:
+                return None
+            return LatestState(**structs.asdict(self._latest), age=monotonic() - self._received)
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
         """Wait for the state of a motion command or of a newer one, and return it.

@@ -58,15 +58,15 @@ ALLOWED = {
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries archives",
     "server/simulation/effects": "queries archives avatars simulation/world",
     "server/simulation": "runtime scene_interface.py avatars queries archives simulation/world",
-    "server/scene_archives.py": "kernels avatars residency archives simulation/effects",
+    "server/open_scene_file.py": "kernels avatars residency archives simulation/effects",
     "server/pictures": "avatars archives",
     "server/scene.py": (
-        "observability runtime scene_interface.py avatars residency queries archives simulation scene_archives.py "
+        "observability runtime scene_interface.py avatars residency queries archives simulation open_scene_file.py "
         "pictures tiles"
     ),
     "server/report/common": "cli/input cli/output avatars residency scene.py",
     "server/cli/input": "scene_interface.py",
-    "server/cli/scene_files": "scene_interface.py residency archives scene_archives.py scene.py",
+    "server/cli/scene_files": "scene_interface.py residency archives open_scene_file.py scene.py",
     "server/report/accuracy/measurement": "avatars scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "scene.py report/common report/accuracy/measurement report/accuracy/page",

@@ -339,22 +339,22 @@ def _check_model(_: str, text: str) -> None:
     parse_radius_model(text)
 
 
-def _check_length(what: str, value: float) -> None:
+def check_length(what: str, value: float) -> None:
     """Raise BadRequestError for a negative or non-finite length (NUMERICS.md N7, cases 14, 15)."""
     if not 0 <= value < math.inf:
         raise BadRequestError(f"{what} is {value}: expected a finite number of metres, 0 or more")
 
 
-def _check_duration(what: str, value: float) -> None:
+def check_duration(what: str, value: float) -> None:
     """Raise BadRequestError for a negative or non-finite duration."""
     if not 0 <= value < math.inf:
         raise BadRequestError(f"{what} is {value}: expected milliseconds, 0 or more")
 
 
-def _check_integer(what: str, value: int, most: int, least: int = 0) -> None:
+def check_integer(what: str, value: int, most: int, least: int = 0) -> None:
     """Raise BadRequestError for anything but an integer from `least` to `most`."""
     try:
-        fits = least <= operator.index(value) <= most
+        fits = not isinstance(value, bool) and least <= operator.index(value) <= most
     except TypeError:
         fits = False
     if not fits:
@@ -382,15 +382,15 @@ def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
         elif ModelName in kinds:
             found.append((name, _check_model))
         elif Length in kinds:
-            found.append((name, _check_length))
+            found.append((name, check_length))
         elif Duration in kinds:
-            found.append((name, _check_duration))
+            found.append((name, check_duration))
         else:
             for one in kinds:
                 for meta in getattr(one, "__metadata__", ()):
                     if getattr(meta, "le", None) is not None:
                         least, most = meta.ge or 0, meta.le
                         found.append(
-                            (name, lambda what, value, a=least, b=most: _check_integer(what, value, b, a))
+                            (name, lambda what, value, a=least, b=most: check_integer(what, value, b, a))
                         )
     return tuple(found)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.kernels.core.reach import VoxelTree
-from solidcloud.server.queries.scene_data import make_tree
+from solidcloud.server.queries.query_inputs import make_tree
 from solidcloud.server.report.load.users.user_traces import Centers
 from solidcloud.server.residency.prefetch import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
 

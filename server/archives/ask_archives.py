@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ...schemas.wire.answers import ContactsAnswers, Cost, Part
 from ...schemas.wire.question_rules import Question
 from ..avatars.avatar_model import AvatarModel
+from ..queries.load_and_search import ask_until_stopped
 from ..queries.path import path_question
-from ..queries.request import QueryBudget, ask_until_stopped, make_budget
-from ..queries.scene_data import SceneData, with_stop
+from ..queries.query_inputs import QueryBudget, SceneData, make_budget, with_stop
 from ..runtime.stop_flag import NO_STOP, StopFlag
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
 from .placed_archive import ArchiveGeneration, PlacedArchive

@@ -29,8 +29,8 @@ from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.engine_table import warm_engines
 from ..queries.level_of_detail import open_level_data, with_level
-from ..queries.raycast import make_directions
-from ..queries.scene_data import SceneData, make_scene_data, make_tree, with_radius_model
+from ..queries.query_inputs import SceneData, make_scene_data, make_tree, with_radius_model
+from ..queries.rays_and_points import make_directions
 from ..residency.level_store import fill_level, open_level_store
 from ..residency.prefetch import Prefetcher, User, UserTracks
 from ..residency.voxel_cache import EvictionPolicy, VoxelCache, prefetches

@@ -15,7 +15,7 @@ pair is that with the least D2.
 """
 
 import math
-from typing import Any
+import time
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.reach import VoxelLists, VoxelsInReach
+from ..kernels.core.reach import VoxelLists
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import (
     AVATAR,
@@ -33,22 +33,37 @@ from ..kernels.nearest.nearest_search import (
     NORMAL,
     SIGNED,
     nearest_poses,
+    nearest_resident,
     write_results,
 )
-from .level_of_detail import below, find_level, level_budget, level_reach
-from .request import EXACT, CostCounter, QueryBudget, check_request, kernel_poses, unseen_from
-from .resolve import Search, Steps, answered, drop_items, load_and_search, resolve
-from .scene_data import LevelOfDetail, SceneData, to_units, with_stop
+from .collide import MAX_FAST_POINTS, search_resident
+from .level_of_detail import ask_level, below, find_level, search_level
+from .load_and_search import Search, Slices, answered, drop_items, next_near, resolve
+from .query_inputs import (
+    EXACT,
+    LevelOfDetail,
+    PoseQuery,
+    QueryBudget,
+    SceneData,
+    has_unknown,
+    kernel_poses,
+    make_query,
+    refuse,
+    to_units,
+)
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
 # Conversion to metres widens bounds by some exact units; a smaller tolerance has no effect.
 TOLERANCE_SLACK = 8.0
+# Limit of the reach in `search_resident` [m]: with nothing near, the time grows with the number of voxels.
+MAX_FAST_REACH = 2.0
+_CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
 
 
-def distance_steps(
+def distance_slices(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
-) -> Steps[DistanceAnswers]:
+) -> Slices[DistanceAnswers]:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
     poses: (k, 4, 4) float64, avatar to world, rigid.
@@ -60,54 +75,82 @@ def distance_steps(
     examined pair, and exact only if nothing else can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    spent = CostCounter(data)
-    array, reach_units = kernel_poses(poses), to_units(reach, "reach")
-    around = check_request(data, avatar, array, data.radius_units + reach_units)
-    nearest, counts = no_pairs(len(array)), np.zeros((3, len(array)), np.uint32)
+    reach_units = to_units(reach, "reach")
+    query = make_query(data, avatar, poses, reach_units, budget)
+    k, per_step = len(query.poses), data.arrays.units_per_step
+    nearest, counts = no_pairs(k), np.zeros((3, k), np.uint32)
     # A level does not know the radii of a scene with several.
     level = find_level(data, budget) if len(data.arrays.radius_deficit) == 1 else None
 
     # Of what absent voxels hold, by the level; of those that need not be loaded; of the others [steps].
-    absent_bound, settled_bound = np.zeros(len(array)), np.full(len(array), np.inf)
-    resident_bound = np.full(len(array), np.inf)
+    absent_bound, settled_bound = np.zeros(k), np.full(k, np.inf)
+    resident_bound = np.full(k, np.inf)
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         lists = _drop_farther(data, lists, nearest)
         resident_bound[:], nearest.missing_bound[:] = nearest.missing_bound, np.inf
         which = np.flatnonzero(np.diff(lists.starts))
         if level is None or not len(which):
             return lists
-        absent_bound[which] = yield from _ask_level(
-            level,
-            avatar,
-            array[which],
-            which,
-            lists.rows[: lists.starts[-1]],
-            reach_units,
-            budget,
-            nearest,
-            spent,
-        )
-        units = absent_bound * data.arrays.units_per_step
-        settled = _is_within(nearest, units, around.units, budget)
+        absent_bound[which] = _bound_by_level(level, query, which, lists.rows[: lists.starts[-1]], nearest)
+        settled = _is_within(nearest, absent_bound * per_step, query.around.units, budget)
         settled_bound[which] = np.where(settled, absent_bound, np.inf)[which]
         return drop_items(lists, settled)
 
-    if len(avatar.points):
-        search = _search(
-            with_stop(data, budget.stop), avatar, array, around, reach_units, budget, nearest, counts
-        )
-        left = yield from resolve(data, around.lists, search, budget, spent, settle)
-        missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
-        missing = np.minimum(missing, settled_bound)
-        np.minimum(missing, resident_bound, out=nearest.missing_bound)
-        np.minimum(nearest.missing_bound, unseen_from(data, around), out=nearest.missing_bound)
-    return DistanceAnswers(
-        **_columns(data, around, float(reach), reach_units, nearest, counts), **spent.fields()
+    left = yield from resolve(
+        query.data, query.around.lists, _search(query, nearest, counts), budget, query.spent, settle
     )
+    missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
+    missing = np.minimum(missing, settled_bound)
+    nearest.missing_bound[:] = np.minimum(np.minimum(missing, resident_bound), query.unseen)
+    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
+    write_results(nearest, query.radii, float(reach), data.arrays, results, exact)
+    signed, lower = results[:, SIGNED].copy(), results[:, LOWER].copy()
+    clear = np.where(exact | (lower > 0), Verdict.CLEAR, Verdict.UNKNOWN)
+    return DistanceAnswers(
+        verdict=np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), signed_distance=signed,
+        lower=lower, upper=signed.copy(), exact=exact, witness_avatar=results[:, AVATAR:CLOUD].copy(),
+        witness_cloud=results[:, CLOUD:].copy(), normal=results[:, NORMAL:AVATAR].copy(),
+        outside=query.around.outside, voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2],
+        **query.spent.fields(),
+    )  # fmt: skip
 
 
-distance = answered(distance_steps)
+distance = answered(distance_slices)
+
+
+def distance_fast(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
+) -> DistanceAnswers:
+    """Answer `distance`, in one kernel call if there is one pose and the fast path applies."""
+    begin = time.perf_counter()
+    poses = kernel_poses(poses)
+    if (
+        len(poses) != 1
+        or not 0.0 <= reach <= MAX_FAST_REACH
+        or len(avatar.points) > MAX_FAST_POINTS
+        or has_unknown(data)
+    ):
+        return distance(data, avatar, poses, reach, budget)
+    reach_units = to_units(reach, "reach")
+    result = np.empty(COLUMNS)
+    before = poses, avatar.reference, avatar.radius, data.radius_units, reach_units, float(reach)
+    (fault, found, needed, visits, tests), outside = search_resident(
+        data, budget, nearest_resident, before, (result,)
+    )
+    refuse(fault, 0, found)
+    if needed < 0:
+        return distance(data, avatar, poses, reach, budget)
+    # The columns of `distance`, made for many poses, would take half as long again as the search.
+    signed, row, residency = result[SIGNED:LOWER], result[None], data.residency
+    return DistanceAnswers(
+        verdict=np.array([_CONTACT if signed[0] <= 0.0 else _CLEAR], np.uint8), signed_distance=signed,
+        lower=result[LOWER:NORMAL], upper=signed.copy(), exact=np.ones(1, bool), witness_avatar=row[:, AVATAR:CLOUD],
+        witness_cloud=row[:, CLOUD:], normal=row[:, NORMAL:AVATAR], outside=outside,
+        voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
+        point_tests=np.array([tests], np.uint32), engine_seconds=time.perf_counter() - begin, hits=needed,
+        resident=residency.resident, resident_bytes=residency.resident_bytes,
+    )  # fmt: skip
 
 
 def no_pairs(k: int) -> NearestPairs:
@@ -117,26 +160,18 @@ def no_pairs(k: int) -> NearestPairs:
     )
 
 
-def _search(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    reach: VoxelsInReach,
-    beyond: int,
-    budget: QueryBudget,
-    nearest: NearestPairs,
-    counts: NDArray[np.uint32],
-) -> Search:
+def _search(query: PoseQuery, nearest: NearestPairs, counts: NDArray[np.uint32]) -> Search:
     """Return the search of `resolve`: it writes `nearest` and counts (3, k)."""
+    budget = query.budget
     tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
 
     def search(
         lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
     ) -> None:
-        own = reach._replace(lists=lists)
+        own = query.around._replace(lists=lists)
         nearest_poses(
-            poses, avatar.arrays, data.arrays, own, which, cursor, state, beyond, budget.relative, tolerance,
-            nearest, counts,
+            query.poses, query.avatar.arrays, query.data.arrays, own, which, cursor, state, query.beyond,
+            budget.relative, tolerance, nearest, counts,
         )  # fmt: skip
 
     return search
@@ -144,40 +179,30 @@ def _search(
 
 def _drop_farther(data: SceneData, lists: VoxelLists, nearest: NearestPairs) -> VoxelLists:
     """Return lists without items whose next voxel is farther than the pair found."""
-    k = len(nearest.square)
-    held = np.flatnonzero(np.diff(lists.starts))
-    next_units = np.full(k, np.inf)
-    next_units[held] = lists.near[lists.starts[:-1][held]] * data.arrays.units_per_step
+    next_units = next_near(lists, lists.starts[:-1]) * data.arrays.units_per_step
     found = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64)) + 2.0 + nearest.deficit
     return drop_items(lists, (nearest.square >= 0) & (next_units > found))
 
 
-def _ask_level(
+def _bound_by_level(
     level: LevelOfDetail,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
+    query: PoseQuery,
     which: NDArray[np.int64],
     rows: NDArray[np.int64],
-    reach_units: int,
-    budget: QueryBudget,
     nearest: NearestPairs,
-    spent: CostCounter,
-) -> Steps[NDArray[np.float64]]:
-    """Return lower bounds (k,) of the distance of the scene's voxels `rows` from the avatar's centres [steps].
+) -> NDArray[np.float64]:
+    """Return lower bounds of the distance of the scene's voxels `rows` from the avatar's centres [steps].
 
-    Of poses (k, 4, 4), numbers `which`. A representative nearer than the pair in `nearest` replaces it.
+    Of the poses numbered in `which`. A representative nearer than the pair in `nearest` replaces it.
     """
-    k, covers, points, exact = len(poses), level.covers, level.points, level_budget(budget)
-    around, near = (level_reach(each, avatar, poses, reach_units) for each in (covers, points))
-    if around is None or near is None:
+    k, covers, points = len(which), level.covers, level.points
+    by_covers, by_points = (ask_level(query, each, which, query.beyond) for each in (covers, points))
+    if by_covers is None or by_points is None:
         return np.zeros(k)
-    own, counts = CostCounter(covers), np.zeros((3, k), np.uint32)
-    covered, pairs = no_pairs(k), no_pairs(k)
-    search = _search(covers, avatar, poses, around, reach_units, exact, covered, counts)
-    left = yield from load_and_search(covers, below(level, around.lists, rows), search, exact, own)
-    search = _search(points, avatar, poses, near, reach_units, exact, pairs, counts)
-    yield from load_and_search(points, near.lists, search, exact, own)
-    spent.add_level(own)
+    covered, pairs, counts = no_pairs(k), no_pairs(k), np.zeros((3, k), np.uint32)
+    own = below(level, by_covers.around.lists, rows)
+    left = search_level(query, by_covers, own, _search(by_covers, covered, counts))
+    search_level(query, by_points, by_points.around.lists, _search(by_points, pairs, counts))
     closer = _lengths(pairs) < _lengths(nearest)[which]
     at = which[closer]
     nearest.square[at], nearest.pair[at], nearest.deficit[at] = pairs.square[closer], pairs.pair[closer], 0
@@ -219,30 +244,3 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
     above = (square - radii * radii).astype(np.float64)
     both = np.sqrt(square.astype(np.float64)) + radii.astype(np.float64)
     return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
-
-
-def _columns(
-    data: SceneData,
-    reach: VoxelsInReach,
-    farthest: float,
-    reach_units: int,
-    nearest: NearestPairs,
-    counts: NDArray[np.uint32],
-) -> dict[str, Any]:
-    """Return the fields of `DistanceAnswers` except the cost of the request.
-
-    farthest: the requested reach [m].  reach_units: the same, exact units.
-    nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
-    examined.
-    """
-    k = len(nearest.square)
-    results, exact = np.empty((k, COLUMNS)), np.empty(k, bool)
-    write_results(nearest, reach.units - reach_units, farthest, data.arrays, results, exact)
-    signed, lower = results[:, SIGNED].copy(), results[:, LOWER].copy()
-    clear = np.where(exact | (lower > 0), Verdict.CLEAR, Verdict.UNKNOWN)
-    return {
-        "verdict": np.where(signed <= 0, Verdict.CONTACT, clear).astype(np.uint8), "signed_distance": signed,
-        "lower": lower, "upper": signed.copy(), "exact": exact, "witness_avatar": results[:, AVATAR:CLOUD].copy(),
-        "witness_cloud": results[:, CLOUD:].copy(), "normal": results[:, NORMAL:AVATAR].copy(),
-        "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
-    }  # fmt: skip

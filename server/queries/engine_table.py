@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ...schemas.wire.question_rules import Question
 from ...schemas.wire.question_table import (
     COLLIDE,
     CONTACTS,
@@ -21,16 +20,13 @@ from ...schemas.wire.question_table import (
     WITHIN,
 )
 from ..avatars.avatar_model import make_avatar
-from .collide import collide
+from .collide import collide_fast
 from .contacts import contacts
-from .distance import distance
+from .distance import distance_fast
 from .objects import objects
-from .one_item import collide_fast, distance_fast, sweep_fast
-from .raycast import raycast
-from .request import EXACT, QueryBudget
-from .scene_data import SceneData
-from .sweep import sweep
-from .within import within
+from .query_inputs import QueryBudget, SceneData
+from .rays_and_points import raycast, within
+from .sweep import sweep_fast
 
 ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,
@@ -48,33 +44,21 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
 
     place: a scan point, world [m]; its voxel is loaded.  part: one of warming_parts.py.
     """
-    pose = np.eye(4)[None]
+    if part not in QUESTIONS:
+        return
+    question, pose = QUESTIONS[part], np.eye(4)[None]
     pose[0, :3, 3] = place
-    points, poses = pose[:, :3, 3].copy(), np.concatenate([pose, pose])
     avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
-    groups = np.full(2, 0xFFFFFFFF, np.uint32)
-    samples: dict[str, Any] = {
-        "avatar": avatar, "poses": pose, "pose_from": pose, "pose_to": pose, "points": points, "origins": points,
-        "directions": np.array([[0.0, 0.0, 1.0]]), "reach": 0.01,
-    }  # fmt: skip
-
-    def run(question: Question[Any], budget: QueryBudget) -> None:
+    # One pose or motion takes other kernels than several do, and a tolerance asks the level of detail.
+    for k, tolerance in ((2, 0.0), (1, 0.0), (1, 1e-3)):
+        poses = np.repeat(pose, k, axis=0)
+        points, groups = poses[:, :3, 3].copy(), np.full(k, 0xFFFFFFFF, np.uint32)
+        samples: dict[str, Any] = {
+            "avatar": avatar, "poses": poses, "pose_from": poses, "pose_to": poses, "points": points,
+            "origins": points, "directions": np.full((k, 3), [0.0, 0.0, 1.0]), "reach": 0.01,
+        }  # fmt: skip
+        arguments = [samples[name] for name in question.arguments if name in samples]
         if question.name == OBJECTS.name:
-            objects(data, [avatar, avatar], poses, groups, groups, budget=budget)
-            return
-        if question.name == COLLIDE.name:  # several poses use other kernels than one pose
-            collide(data, avatar, poses, 0.0, budget)
-        if question.name == DISTANCE.name:
-            distance(data, avatar, poses, 0.01, budget)
-        if question.name == SWEEP.name:
-            sweep(data, avatar, poses, poses, budget=budget)
-        arguments = [
-            samples[name] for name in question.arguments if name in question.required or name in samples
-        ]
-        tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
-        ENGINES[question.name](data, *arguments, budget=budget._replace(tolerance=tolerance))
-
-    if part in QUESTIONS:
-        run(QUESTIONS[part], EXACT)
-    if part == COLLIDE.name:
-        run(COLLIDE, QueryBudget(tolerance=1e-3))
+            arguments = [[avatar] * k, poses, groups, groups]
+        tolerance = max(tolerance, question.other_defaults.get("tolerance", 0.0))
+        ENGINES[part](data, *arguments, budget=QueryBudget(tolerance=tolerance))

@@ -16,13 +16,20 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.level import cover_units, halvings_between
 from ...schemas.archive.voxel_grid import voxel_keys
 from ...schemas.errors import BadRequestError, TooLargeError
-from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.reach import VoxelLists, VoxelsInReach
+from ..kernels.core.reach import VoxelLists
 from ..residency.voxel_cache import VoxelCache
 from ..runtime.stop_flag import StoppedError
-from .request import QueryBudget, check_request
-from .resolve import drop_entries
-from .scene_data import LevelOfDetail, SceneData, make_scene_data, with_stop
+from .load_and_search import Search, drop_entries, load_and_search, run
+from .query_inputs import (
+    CostCounter,
+    LevelOfDetail,
+    PoseQuery,
+    QueryBudget,
+    SceneData,
+    check_request,
+    make_scene_data,
+    with_stop,
+)
 
 
 def open_level_data(
@@ -75,19 +82,30 @@ def find_level(data: SceneData, budget: QueryBudget) -> LevelOfDetail | None:
     return level._replace(covers=covers, points=points)
 
 
-def level_reach(
-    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], beyond: int
-) -> VoxelsInReach | None:
-    """Return the voxels of a level in reach of poses (k, 4, 4); None if its spheres reach too far.
+def ask_level(query: PoseQuery, data: SceneData, which: NDArray[np.int64], beyond: int) -> PoseQuery | None:
+    """Make the exact query of a level about some poses of a query, which the scene has accepted.
 
-    The scene has accepted the poses, but cover spheres are larger than its own.
-    data: covers or points of a level.  beyond: the part of the reach that is not the radii, exact
-    units.
+    data: covers or points of the level.  which: numbers of the poses.  beyond: the part of the reach
+    that is not the radii, exact units.
+    Return None if there are no poses, or the spheres of the level, larger than the scene's, reach too far.
     """
+    if not len(which):
+        return None
+    poses = query.poses[which]
     try:
-        return check_request(data, avatar, poses, data.radius_units + beyond)
+        around = check_request(data, query.avatar, poses, data.radius_units + beyond)
     except (BadRequestError, TooLargeError, StoppedError):
         return None
+    return PoseQuery(data, query.avatar, poses, beyond, around, level_budget(query.budget), CostCounter(data))
+
+
+def search_level(
+    query: PoseQuery, asked: PoseQuery, lists: VoxelLists, search: Search
+) -> NDArray[np.float64]:
+    """Search voxels of the level, and return as `load_and_search`. asked: by `ask_level` for `query`."""
+    left = run(load_and_search(asked.data, lists, search, asked.budget, asked.spent))
+    query.spent.add_level(asked.spent)
+    return left
 
 
 def below(level: LevelOfDetail, lists: VoxelLists, rows: NDArray[np.int64]) -> VoxelLists:

@@ -5,7 +5,8 @@ current pose.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,13 +14,23 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import ObjectsAnswers
+from ...schemas.wire.question_table import COLLIDE
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..runtime.stop_flag import NO_STOP, StoppedError
-from .one_item import collide_fast
-from .request import EXACT, CostCounter, QueryBudget, check_avatar, kernel_poses
-from .scene_data import SceneData, to_units, with_stop
+from ..runtime.stop_flag import NO_STOP
+from .collide import collide_fast
+from .load_and_search import ask_until_stopped
+from .query_inputs import (
+    EXACT,
+    CostCounter,
+    QueryBudget,
+    SceneData,
+    check_avatar,
+    kernel_poses,
+    to_units,
+    with_stop,
+)
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -40,17 +51,6 @@ class CheckedObjects(NamedTuple):
     masks: NDArray[np.uint32]
     units: NDArray[np.int64]
     margin_units: int
-
-
-class ObjectContacts(NamedTuple):
-    """Contacts between objects; fields as in `ObjectsAnswers`."""
-
-    pairs: NDArray[np.int32]
-    pair_verdict: NDArray[np.uint8]
-    pairs_tested: int
-    pairs_filtered: int
-    pair_visits: int
-    pair_tests: int
 
 
 def objects(
@@ -81,18 +81,14 @@ def objects(
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
-        try:
-            found = collide_fast(data, model, checked.poses[rows], margin, budget)
-        except StoppedError:
-            verdict[rows] = UNKNOWN
-            continue
+        ask = partial(collide_fast, data, model, checked.poses[rows], margin, budget)
+        found = ask_until_stopped(COLLIDE, len(rows), budget, ask)
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)
-    contacts = _touching_pairs(checked, data.arrays.origin, budget)
-    return ObjectsAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], *contacts, **spent.fields()
-    )  # fmt: skip
+    pairs = _touching_pairs(checked, data.arrays.origin, budget)
+    missing, visits, tests = counts
+    return ObjectsAnswers(verdict, outside, missing, visits, tests, **pairs, **spent.fields())
 
 
 def _check(
@@ -173,8 +169,8 @@ def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[ND
 
 def _touching_pairs(
     checked: CheckedObjects, origin: NDArray[np.float64], budget: QueryBudget
-) -> ObjectContacts:
-    """Test the pairs, those of the same two avatars in one kernel call."""
+) -> dict[str, Any]:
+    """Test the pairs, those of the same two avatars in one kernel call; return the fields of the answers."""
     pairs, filtered = find_pairs(checked, origin)
     kinds = checked.model_of[pairs]
     # Contact is symmetric, so two avatars are tested in one order only.
@@ -203,4 +199,7 @@ def _touching_pairs(
         tested += len(rows)
     listed = verdict != CLEAR
     visits, tests = counters.tolist()
-    return ObjectContacts(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)
+    return {
+        "pairs": pairs[listed].astype(np.int32), "pair_verdict": verdict[listed], "pairs_tested": tested,
+        "pairs_filtered": filtered, "pair_visits": visits, "pair_tests": tests,
+    }  # fmt: skip

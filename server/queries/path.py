@@ -19,8 +19,8 @@ from ...schemas.wire.question_table import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at
 from .engine_table import ENGINES
-from .request import ask_until_stopped, check_avatar, kernel_poses, make_budget, unknown_answers
-from .scene_data import SceneData, to_units, with_stop
+from .load_and_search import ask_until_stopped, unknown_answers
+from .query_inputs import SceneData, check_avatar, kernel_poses, make_budget, to_units, with_stop
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2
@@ -35,8 +35,6 @@ PART_SECONDS = 0.01
 _PART_BYTES = 8 << 20
 
 Ask = Callable[[int, int], Cost]
-
-
 # Function that computes answers [start, end) of a path, which form a part that begins at a time on
 # time.perf_counter()'s clock [s].
 AskPart = Callable[[int, int, float], Cost]
@@ -107,24 +105,19 @@ def path_parts(
     """Yield the parts of a path in order; one empty part if the path is empty.
 
     most: limit of answers in a part.  pool: executor that computes up to `ahead` parts before they
-    are consumed; None: each part is computed on demand. Closing the generator cancels waiting
+    are consumed; None: each part is computed on demand, with `ahead` 1. Closing the generator cancels waiting
     parts; running ones complete.
     """
     waiting: deque[tuple[int, Future[Cost]]] = deque()
-    size, start = min(FIRST_PART, most), 0
+    size, start, submit = min(FIRST_PART, most), 0, _call_now if pool is None else pool.submit
     try:
         while waiting or start < max(1, total):
-            while pool is not None and start < max(1, total) and len(waiting) < ahead:
+            while start < max(1, total) and len(waiting) < ahead:
                 stop = min(start + size, total)
-                waiting.append((start, pool.submit(_ask_part, ask, start, stop)))
+                waiting.append((start, submit(_ask_part, ask, start, stop)))
                 start = max(1, stop)
-            if pool is None:
-                first, stop = start, min(start + size, total)
-                answers = _ask_part(ask, first, stop)
-                start = max(1, stop)
-            else:
-                first, future = waiting.popleft()
-                answers = future.result()
+            first, future = waiting.popleft()
+            answers = future.result()
             for piece in split_answers(answers, _PART_BYTES):
                 yield answers_to_part(piece, first, total)
                 first += len(piece)  # type: ignore[arg-type]
@@ -132,6 +125,13 @@ def path_parts(
     finally:
         for _, future in waiting:
             future.cancel()
+
+
+def _call_now(call: Callable[..., Cost], *arguments: Any) -> Future[Cost]:
+    """Call a function in this thread, and return its result as an executor does."""
+    done: Future[Cost] = Future()
+    done.set_result(call(*arguments))
+    return done
 
 
 def _ask_part(ask: Ask, start: int, stop: int) -> Cost:

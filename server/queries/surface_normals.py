@@ -14,8 +14,8 @@ from ...schemas.errors import BadRequestError, CorruptError
 from ..kernels.core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code, squared_reach
 from ..kernels.rays.surface import add_near, voxels_near
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
-from .request import parts_that_fit
-from .scene_data import SceneData
+from .load_and_search import parts_that_fit
+from .query_inputs import SceneData
 
 _NO_DIRECTIONS = np.empty((0, 3))
 

@@ -55,7 +55,7 @@ from ...schemas.wire.motion_messages import (
 from ...schemas.wire.stats import EffectStats
 from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
-from ..queries.request import EXACT, LateVoxels, QueryBudget
+from ..queries.query_inputs import EXACT, LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, Session, recording_avatars
 from .replay_log import FrameLog, LoggedTurn, take_record

@@ -32,7 +32,7 @@ from solidcloud.server.kernels.core.reach import (
 from solidcloud.server.kernels.core.scene_arrays import LANES, ROW_WORDS, SceneArrays
 from solidcloud.server.kernels.nearest.nearest_pair import unmark_beyond_box
 from solidcloud.server.kernels.rays.hits import HitBatch
-from solidcloud.server.queries import nearest_hits
+from solidcloud.server.queries import rays_and_points
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
 
@@ -175,7 +175,7 @@ def test_case_39_lists_of_voxels_leave_none_out(step: float, origin: tuple[float
     data: Any = SimpleNamespace(arrays=scene, tree=tree)
     for along in (False, True):
         batch = HitBatch(at_units, aims if along else aims[:0], reach, radius if along else 0)
-        lists = nearest_hits._list(data, batch)
+        lists = rays_and_points._list(data, batch)
         found = 0
         for i, row in itertools.product(range(k), range(6)):
             own = slice(lists.starts[i], lists.starts[i + 1])

@@ -62,7 +62,6 @@ FILES = {
 MOVING = {"sweep", "slide", "ground", "step", "crowd"}
 # What only some effects have a use for, and which.
 HELPERS = {
-    "server.queries.distance_per_scan": {"uncertainty"},
     "server.archives.masked_store": {"through"},
     "server.simulation.world.bodies": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},

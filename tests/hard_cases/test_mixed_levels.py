@@ -20,7 +20,7 @@ from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.query_inputs import QueryBudget
 from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene

@@ -8,7 +8,7 @@ import pytest
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.query_inputs import QueryBudget
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict

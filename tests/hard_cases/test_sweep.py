@@ -16,7 +16,7 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.query_inputs import QueryBudget
 from sweep_poses import at, turn_z
 
 POINT = np.zeros((1, 3))

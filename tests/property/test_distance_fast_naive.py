@@ -18,9 +18,8 @@ from sample_sizes import sample
 from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.wire.answers import DistanceAnswers
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.one_item import MAX_FAST_REACH, distance_fast
-from solidcloud.server.queries.scene_data import SceneData
+from solidcloud.server.queries.distance import MAX_FAST_REACH, distance, distance_fast
+from solidcloud.server.queries.query_inputs import SceneData
 from solidcloud.server.scene import Scene
 
 COLUMNS = (

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
 from sample_sizes import sample
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.distance_per_scan import separation_per_scan
+from solidcloud.server.queries.contacts import contacts, separation_per_scan
 
 SCANS = 4
 

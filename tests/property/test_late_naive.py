@@ -20,9 +20,9 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.request import LateVoxels, QueryBudget
+from solidcloud.server.queries.query_inputs import LateVoxels, QueryBudget
+from solidcloud.server.queries.rays_and_points import within
 from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
-from solidcloud.server.queries.within import within
 from solidcloud.server.scene import Scene
 
 MODELS = (*radius_class_archives.MODELS, "local", "border:0.5")

@@ -17,7 +17,7 @@ from point_clouds import signed_permutations
 from sample_sizes import sample
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data
+from solidcloud.server.queries.query_inputs import SceneData, make_scene_data
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

@@ -19,8 +19,7 @@ from sample_sizes import sample
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
-from solidcloud.server.queries.raycast import raycast
-from solidcloud.server.queries.within import within
+from solidcloud.server.queries.rays_and_points import raycast, within
 
 MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0")
 

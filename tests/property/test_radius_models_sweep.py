@@ -21,7 +21,7 @@ from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSE
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.query_inputs import QueryBudget
 from solidcloud.server.scene import Scene
 
 FOUND = ("verdict", "lower", "upper", "exact", "outside", "witness_avatar", "witness_cloud")

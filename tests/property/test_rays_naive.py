@@ -18,9 +18,8 @@ from point_clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
 from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from sample_sizes import sample
 from solidcloud.server.kernels.rays.hits import first_meeting
-from solidcloud.server.queries.raycast import raycast
-from solidcloud.server.queries.scene_data import SceneData
-from solidcloud.server.queries.within import within
+from solidcloud.server.queries.query_inputs import SceneData
+from solidcloud.server.queries.rays_and_points import raycast, within
 
 
 def stored(case: archive_cases.Case, data: SceneData) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from solidcloud.server.kernels.collide.collide_poses import CLEAR, CONTACT, EARLY, UNKNOWN, set_early
 from solidcloud.server.queries.collide import verdict_bounds
-from solidcloud.server.queries.request import QueryBudget
+from solidcloud.server.queries.query_inputs import QueryBudget
 
 
 @pytest.mark.interpreted

@@ -15,8 +15,13 @@ from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
 from solidcloud.server.archives.scene_info import describe
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.request import EXACT, QueryBudget
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.queries.query_inputs import (
+    EXACT,
+    QueryBudget,
+    SceneData,
+    make_scene_data,
+    with_radius_model,
+)
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

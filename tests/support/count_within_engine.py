@@ -6,23 +6,15 @@ from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.core.reach import MISSING, NOT_HELD, Items, VoxelLists, find_lists
 from solidcloud.server.kernels.core.scene_arrays import LANES, SceneArrays
-from solidcloud.server.queries.nearest_hits import make_origins
-from solidcloud.server.queries.request import EXACT, CostCounter, QueryBudget
-from solidcloud.server.queries.resolve import Steps, resolve, run
-from solidcloud.server.queries.scene_data import SceneData, to_units
+from solidcloud.server.queries.load_and_search import resolve, run
+from solidcloud.server.queries.query_inputs import EXACT, CostCounter, QueryBudget, SceneData, to_units
+from solidcloud.server.queries.rays_and_points import make_origins
 
 
 def count_within(
     data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> CountWithinAnswers:
     """Count the scan points of one archive within `reach` [m] of each of k points (k, 3)."""
-    return run(count_within_steps(data, points, reach, budget))
-
-
-def count_within_steps(
-    data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
-) -> Steps[CountWithinAnswers]:
-    """Answer `count_within` in slices."""
     spent = CostCounter(data)
     _, units = make_origins(data, points, "points")
     reach_units, k = to_units(reach, "reach"), len(units)
@@ -51,7 +43,7 @@ def count_within_steps(
     at = units / scene.units_per_step
     span = np.full(k, reach_units / scene.units_per_step + 1.0)  # a step more exceeds what rounding loses
     lists = find_lists(data.tree, Items(at, at, span, np.zeros(k)), budget.request.flag)
-    left = yield from resolve(data, lists, search, budget, spent)
+    left = run(resolve(data, lists, search, budget, spent))
     exact = (missing == 0) & (np.minimum(lists.unseen, left) == np.inf) & (not data.nothing_clear)
     verdict = np.where(counts > 0, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))
     low, high = np.rint(data.tree.scene * scene.units_per_step)

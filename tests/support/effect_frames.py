@@ -12,7 +12,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.rigid_transform import archive_pose, inverse_pose
 from solidcloud.server.avatars.avatar_model import AvatarModel
-from solidcloud.server.queries.request import EXACT, QueryBudget
+from solidcloud.server.queries.query_inputs import EXACT, QueryBudget
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame

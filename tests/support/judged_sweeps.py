@@ -12,7 +12,7 @@ import radius_class_archives
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.queries.query_inputs import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.queries.sweep import DEFAULT_TOLERANCE, sweep
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore

@@ -8,7 +8,7 @@ import naive_rays
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import RaycastAnswers, WithinAnswers
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.queries.query_inputs import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

@@ -8,16 +8,14 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire import question_table as questions
 from solidcloud.schemas.wire.answers import ObjectsAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
-from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.distance_per_scan import separation_per_scan
+from solidcloud.server.queries.collide import collide_fast
+from solidcloud.server.queries.contacts import contacts, separation_per_scan
+from solidcloud.server.queries.distance import distance, distance_fast
+from solidcloud.server.queries.load_and_search import ask_until_stopped
 from solidcloud.server.queries.objects import objects
-from solidcloud.server.queries.one_item import collide_fast, distance_fast
-from solidcloud.server.queries.raycast import raycast
-from solidcloud.server.queries.request import QueryBudget, ask_until_stopped
-from solidcloud.server.queries.scene_data import SceneData, with_stop
+from solidcloud.server.queries.query_inputs import QueryBudget, SceneData, with_stop
+from solidcloud.server.queries.rays_and_points import raycast, within
 from solidcloud.server.queries.sweep import sweep
-from solidcloud.server.queries.within import within
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 

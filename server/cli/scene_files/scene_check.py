@@ -13,7 +13,7 @@ from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_
 from ...archives.masked_store import MaskedStore
 from ...archives.rigid_transform import transform_boxes
 from ...archives.scene_info import run_order
-from ...scene_archives import (
+from ...open_scene_file import (
     FoundArchive,
     FoundAvatar,
     error_location,

@@ -19,9 +19,9 @@ from ....schemas.runtime.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, SceneFile, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
 from ...archives.scene_info import describe
+from ...open_scene_file import find_archives, open_archives, read_avatars
 from ...residency.voxel_store import VoxelStore
 from ...scene import DEFAULT_BUDGET, Scene
-from ...scene_archives import find_archives, open_archives, read_avatars
 from ...scene_interface import AvatarShape
 from .scene_text import SceneContent, scene_text
 from .spawn_search import CLEARANCE, add_body, find_spawn

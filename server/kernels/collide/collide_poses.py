@@ -308,7 +308,7 @@ def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, 
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.
     cursor: (k,) int64, entries of `reach.lists` that are examined; a pose is finished at the end of
-    its list.  state: (v,) uint8, what may be examined now, see queries/resolve.py.
+    its list.  state: (v,) uint8, what may be examined now, see queries/load_and_search.py.
     tolerance: exact units by which a pair may exceed the reach and still end the search, as EARLY.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
     tests), whose initial values are CLEAR and 0. A contact, early or not, overrides a missing voxel,

@@ -31,8 +31,7 @@ from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_table import Crowd, Objects
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
-from ...queries.request import QueryBudget
-from ...queries.scene_data import to_units
+from ...queries.query_inputs import QueryBudget, to_units
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
 from ..world.frame import Body, Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 

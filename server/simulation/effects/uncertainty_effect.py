@@ -35,8 +35,8 @@ from ....schemas.scene.effect_table import Uncertainty
 from ....schemas.wire.motion_messages import UncertaintyReport
 from ....schemas.wire.scene_messages import SceneInfo, SourceInfo
 from ...archives.rigid_transform import transform_poses
-from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
-from ...queries.one_item import distance_fast
+from ...queries.contacts import ANY_SCAN, separation_per_scan
+from ...queries.distance import distance_fast
 from ..world.frame import Frame, Run
 from .report_effects import is_farther_than
 

@@ -32,7 +32,7 @@ from ...kernels.bodies.body_pairs import CONTACT, bound_body, find_near_bodies, 
 from ...kernels.bodies.body_sweep import make_body_scratch, sweep_bodies
 from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
-from ...queries.scene_data import to_units
+from ...queries.query_inputs import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Frame, Hit, Pose, Vec, dot, horizontal, norm, rotate, rotate_back
 

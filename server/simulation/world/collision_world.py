@@ -30,10 +30,12 @@ from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.motion.sweep_resident import pose_between
+from ...queries.collide import collide_fast
 from ...queries.contacts import contacts
-from ...queries.one_item import collide_fast, distance_fast, has_unknown, sweep_fast
-from ...queries.request import EXACT, QueryBudget
-from ...queries.within import within
+from ...queries.distance import distance_fast
+from ...queries.query_inputs import EXACT, QueryBudget, has_unknown
+from ...queries.rays_and_points import within
+from ...queries.sweep import sweep_fast
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec, min_height, unit_vector

@@ -15,7 +15,8 @@ from ...archives.ask_archives import HeldArchive
 from ...archives.rigid_transform import transform_points
 from ...kernels.bodies import leave_contact as kernel
 from ...kernels.motion.sweep_resident import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
-from ...queries.request import QueryBudget, parts_that_fit
+from ...queries.load_and_search import parts_that_fit
+from ...queries.query_inputs import QueryBudget
 from .frame import (
     Frame,
     Hit,

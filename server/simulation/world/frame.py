@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.motion.screw_motion import sine_cosine
-from ...queries.request import EXACT, QueryBudget
+from ...queries.query_inputs import EXACT, QueryBudget
 
 Vec = NDArray[np.float64]  # (3,) [m]
 Matrix = NDArray[np.float64]  # (3, 3), or the upper left of a pose (4, 4)

@@ -24,8 +24,8 @@ from ...kernels.motion.sweep_resident import make_scratch
 from ...kernels.walk import state
 from ...kernels.walk.motions import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
-from ...queries.one_item import MAX_FAST_POINTS
-from ...queries.request import EXACT
+from ...queries.collide import MAX_FAST_POINTS
+from ...queries.query_inputs import EXACT
 from .collision_world import SPARSE_FACTOR, World, normals_of
 from .first_hits import find_first_hit, find_touched, first_body_hit, is_clear, touches_bodies
 from .frame import GROUND_PLANE, RAISED, Frame, Hit, Pose, Vec, dot, lowest_height, translated

@@ -19,7 +19,7 @@ from solidcloud.server.archives.scene_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.scene_data import make_scene_data
+from solidcloud.server.queries.query_inputs import make_scene_data
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

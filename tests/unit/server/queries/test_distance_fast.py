@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries import one_item as module
-from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.one_item import distance_fast
+from solidcloud.server.queries import distance as module
+from solidcloud.server.queries.distance import distance, distance_fast
 from solidcloud.server.scene import Scene
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)

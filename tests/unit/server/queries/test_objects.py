@@ -11,8 +11,7 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
-from solidcloud.server.queries.request import make_budget
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data
+from solidcloud.server.queries.query_inputs import SceneData, make_budget, make_scene_data
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

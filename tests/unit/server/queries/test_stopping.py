@@ -11,8 +11,7 @@ import pytest
 import stopped_queries
 import synthetic_scans
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.request import EXACT, QueryBudget
-from solidcloud.server.queries.scene_data import with_stop
+from solidcloud.server.queries.query_inputs import EXACT, QueryBudget, with_stop
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag, StoppedError

@@ -20,7 +20,7 @@ from solidcloud.server.archives.masked_store import MaskedStore
 from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.core.normal_codes import LINE, THICK
 from solidcloud.server.kernels.rays.surface import voxels_near
-from solidcloud.server.queries.scene_data import with_stop
+from solidcloud.server.queries.query_inputs import with_stop
 from solidcloud.server.queries.surface_normals import Normals
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore

@@ -16,8 +16,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.request import QueryBudget, make_budget
-from solidcloud.server.queries.scene_data import SceneData
+from solidcloud.server.queries.query_inputs import QueryBudget, SceneData, make_budget
 from solidcloud.server.queries.sweep import sweep
 
 pytestmark = pytest.mark.interpreted

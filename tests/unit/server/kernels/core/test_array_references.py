@@ -5,7 +5,8 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
-from solidcloud.server.queries.one_item import collide_fast, distance_fast
+from solidcloud.server.queries.collide import collide_fast
+from solidcloud.server.queries.distance import distance_fast
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.core.reach import VoxelsInReach
-from solidcloud.server.queries.request import check_request
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data, to_units
+from solidcloud.server.queries.query_inputs import SceneData, check_request, make_scene_data, to_units
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 

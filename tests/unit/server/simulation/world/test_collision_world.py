@@ -17,7 +17,7 @@ from solidcloud.schemas.scene.effect_table import Contacts, Slide
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.request import LateVoxels, QueryBudget
+from solidcloud.server.queries.query_inputs import LateVoxels, QueryBudget
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import report_effects

@@ -1,34 +1,41 @@
-"""Request of a query: its budget and cost, its checks, and the voxels in reach of its poses.
+"""Inputs of every query: the data of a scene, the budget and the cost of a request, its checked poses.
 
-Every query takes a `QueryBudget`. Without a deadline the work ends when the answer is exact, or
-known within the tolerance. A deadline is a stop flag that is set at that time: the same kernels end,
-and the answer is still correct. See NUMERICS.md case 30.
+Every query takes a `SceneData` and a `QueryBudget`. Without a deadline the work ends when the answer is
+exact, or known within the tolerance. A deadline is a stop flag that is set at that time: the same
+kernels end, and the answer is still correct. See NUMERICS.md case 30.
 """
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
+from ...schemas.archive.archive import Archive
 from ...schemas.archive.pose_arrays import make_poses
+from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.rigid_pose import RENORMALISE
 from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ...schemas.wire.answers import Cost
-from ...schemas.wire.question_rules import Question
+from ...schemas.wire.requests import check_duration, check_length
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core import reach as pose_checks
+from ..kernels.core.array_references import SceneReferences
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.reach import VoxelsInReach, check_poses, find_reach, make_reach
+from ..kernels.core.reach import (
+    VoxelsInReach,
+    VoxelTree,
+    check_poses,
+    find_reach,
+    make_reach,
+    make_voxel_tree,
+)
+from ..kernels.core.scene_arrays import SceneArrays, block_words
 from ..residency.voxel_cache import HeldVoxels, VoxelCache
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
-from .scene_data import SceneData
-
-_A = TypeVar("_A", bound=Cost)
 
 # Share of the remaining time that loads may take; the rest is for searching resident voxels.
 LOAD_SHARE = 0.5
@@ -65,6 +72,132 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
         "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
     ),
 }
+
+
+class LevelOfDetail(NamedTuple):
+    """Representatives of a scene's points (schemas/archive/level.py), as data that queries read.
+
+    covers: the representatives with spheres that contain all spheres of the scene: where these are
+    clear, the scene is.
+    points: the same with the scene's smallest spheres: a contact with one is a contact of the
+    scene.
+    settles_exact: whether requests without a tolerance use the level too.
+    parents: (lv,) int64, for each voxel of the level, the row of the scene's voxel that it divides.
+    """
+
+    covers: "SceneData"
+    points: "SceneData"
+    settles_exact: bool
+    parents: NDArray[np.int64]
+
+
+class SceneData(NamedTuple):
+    """Data of one scene that every query reads; made once, by `make_scene_data`.
+
+    arrays: arrays that the kernels read.  tree: boxes around the points of each voxel and of scans that
+    the build left out, as the index states them.  keys: (v,) uint64, of the voxels, sorted.
+    radius_units: of the largest sphere of a scan point, exact units.
+    unknown_everywhere: whether the build left out a scan with unknown bounds.
+    keeps_scan: whether the arena stores the scan of each point.
+    references: of the data with these radii, for kernels that are called once a pose.
+    level: its level of detail; None if it has none.
+    """
+
+    residency: VoxelCache
+    arrays: SceneArrays
+    tree: VoxelTree
+    keys: NDArray[np.uint64]
+    radius_units: int
+    unknown_everywhere: bool
+    keeps_scan: bool
+    references: SceneReferences
+    level: LevelOfDetail | None = None
+
+    @property
+    def nothing_clear(self) -> bool:
+        """Return whether no place is known to be clear.
+
+        True if a scan with unknown bounds was left out, or a load proved the index wrong.
+        """
+        return self.unknown_everywhere or self.residency.misled
+
+
+def has_unknown(data: SceneData) -> bool:
+    """Return whether a scan was left out anywhere, or a load proved the index wrong."""
+    return data.nothing_clear or len(data.tree.unknown) > 0
+
+
+def to_units(metres: float, what: str) -> int:
+    """Convert a length to exact units, rounded once (NUMERICS.md N5).
+
+    Raise BadRequestError if it is negative or beyond MAX_COORDINATE.
+    """
+    if not 0 <= metres <= MAX_COORDINATE:  # rejects NaN too; kernels take the result as int64
+        raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
+    return round(metres * UNITS_PER_METRE)  # half to even
+
+
+def to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return world positions (n, 3) [m] of lattice points, as `Lattice.to_world` computes them."""
+    return np.asarray(lattice * data.arrays.step + data.arrays.origin)
+
+
+def make_tree(archive: Archive) -> VoxelTree:
+    """Make the boxes around the points of an archive's voxels, as the index states them."""
+    header, voxels = archive.header, archive.voxels
+    base = archive.coordinates * header.lattice.voxel_steps
+    bounds = np.array([header.low, header.high])
+    return make_voxel_tree(base + voxels["low"], base + voxels["high"], bounds, header.unknown)
+
+
+def make_scene_data(archive: Archive, residency: VoxelCache, tree: VoxelTree | None = None) -> SceneData:
+    """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
+
+    tree: `make_tree` of the archive; None: make it.
+    """
+    header = archive.header
+    tree = make_tree(archive) if tree is None else tree
+    lattice = header.lattice
+    arrays = SceneArrays(
+        *residency.buffer.arena,
+        residency.where,
+        archive.coordinates * lattice.voxel_steps,
+        np.array(lattice.origin),
+        lattice.step,
+        lattice.units_per_step,
+        lattice.voxel_steps,
+        block_words(header.radius_class),
+        np.zeros(1, np.int64),
+        NO_STOP.flag,
+    )
+    return SceneData(
+        residency, arrays, tree, archive.voxels["key"].astype(np.uint64),
+        to_units(header.radius, "radius of the archive"), header.unknown_everywhere,
+        header.scan_index, SceneReferences(),
+    )  # fmt: skip
+
+
+def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> SceneData:
+    """Return the same scene with the radii of a model (schemas/archive/radius_model.py).
+
+    text: the model; None: the archive's single radius. Raise BadRequestError for an invalid model,
+    or one that the archive does not contain.
+    """
+    header = archive.header
+    radii = class_radii(text, header.radius, header.models)
+    # Only classes that occur count: on a dense scan all are small, which keeps the reach small. A
+    # node may have a class that no point has, but no sphere of its points is larger than these.
+    largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
+    radius_deficit = np.maximum(largest - radii, 0)
+    arrays = data.arrays._replace(radius_deficit=radius_deficit)
+    return data._replace(arrays=arrays, radius_units=largest, references=SceneReferences())
+
+
+def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
+    """Return the same scene for kernels that `stop` ends early."""
+    return (
+        data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
+    )
 
 
 class LateVoxels:
@@ -152,17 +285,15 @@ def make_budget(
     budget_ms: time limit including waits for loads; None: no limit.
     stop: the request's stop flag; a time limit sets a part of it. Raise BadRequestError.
     """
-    if not 0 <= tolerance < math.inf:
-        raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
+    check_length("tolerance", tolerance)
     if not 0 <= relative_tolerance < math.inf:
         raise BadRequestError(
             f"relative_tolerance is {relative_tolerance}: expected a finite share, 0 or more, as 0.3 for 30 %"
         )
-    if budget_ms is not None and not 0 <= budget_ms < math.inf:
-        raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
     budget = QueryBudget(float(tolerance), stop=stop, relative=float(relative_tolerance), request=stop)
     if budget_ms is None:
         return budget
+    check_duration("budget_ms", budget_ms)
     budget = budget._replace(deadline=time.perf_counter() + budget_ms / 1e3, stop=stop.part())
     stop_at(budget.stop, budget.deadline, "")
     return budget
@@ -170,18 +301,6 @@ def make_budget(
 
 class CostCounter:
     """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
-
-    __slots__ = (
-        "_begin",
-        "_keys",
-        "_residency",
-        "faults",
-        "hits",
-        "late",
-        "loaded",
-        "misses",
-        "wait_seconds",
-    )
 
     def __init__(self, data: SceneData) -> None:
         """Begin now with zero cost. data: of the scene that is queried."""
@@ -223,21 +342,6 @@ class CostCounter:
             "wait_seconds": self.wait_seconds,
             "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
         }
-
-
-def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: Callable[[], _A]) -> _A:
-    """Run a query of k items with `ask`. Add the reason to the answer if the request is stopped."""
-    try:
-        answers = ask()
-    except StoppedError:
-        return unknown_answers(question, k, budget)
-    return structs.replace(answers, stopped=budget.stopped) if budget.stopped else answers
-
-
-def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
-    """Return `Question.unknown` for the k items of a stopped request, with the reason."""
-    answers = question.unknown(k, bounded=budget.tolerance > 0.0)
-    return structs.replace(answers, stopped=budget.stopped)
 
 
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
@@ -302,24 +406,45 @@ def check_request(
             )
 
 
-def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: float) -> Iterator[list[int]]:
-    """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
-    part: list[int] = []
-    taken = 0
-    for row in rows:
-        size = residency.bytes_of([row])
-        if part and taken + size > budget_bytes:
-            yield part
-            part, taken = [], 0
-        part.append(row)
-        taken += size
-    if part:
-        yield part
+class PoseQuery(NamedTuple):
+    """Query about k poses of an avatar, whose arguments are checked.
 
-
-def unseen_from(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
-    """Return lower bounds (k,) of the distance of centres from scans that the build left out [steps].
-
-    inf: no such scan is in reach. Call it after all loads: one may have proved the index wrong.
+    poses: (k, 4, 4) float64, C order.  beyond: margin or reach, exact units.  around: the voxels in
+    reach of each pose.  spent: the cost so far.
     """
-    return np.zeros(len(reach.units)) if data.nothing_clear else reach.lists.unseen
+
+    data: SceneData
+    avatar: AvatarModel
+    poses: NDArray[np.float64]
+    beyond: int
+    around: VoxelsInReach
+    budget: QueryBudget
+    spent: CostCounter
+
+    @property
+    def radii(self) -> NDArray[np.int64]:
+        """Return the sum (k,) of the largest radii of avatar and scan, exact units."""
+        return self.around.units - self.beyond
+
+    @property
+    def unseen(self) -> NDArray[np.float64]:
+        """Return lower bounds (k,) of the distance of centres from scans that the build left out [steps].
+
+        inf: no such scan is in reach. Read it after all loads: one may have proved the index wrong.
+        """
+        if self.data.nothing_clear and len(self.avatar.points):
+            return np.zeros(len(self.poses))
+        return self.around.lists.unseen
+
+
+def make_query(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, beyond: int, budget: QueryBudget
+) -> PoseQuery:
+    """Check a query about poses, and list the voxels in their reach; raise as `check_request`.
+
+    beyond: margin or reach, exact units.
+    """
+    spent, array = CostCounter(data), kernel_poses(poses)
+    around = check_request(data, avatar, array, data.radius_units + beyond)
+    # Only from here on a deadline ends the kernels.
+    return PoseQuery(with_stop(data, budget.stop), avatar, array, beyond, around, budget, spent)

@@ -19,11 +19,9 @@ from solidcloud.schemas.archive.units import UNITS_PER_METRE
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.rays.hits import HitBatch, search_hits
-from solidcloud.server.queries import nearest_hits
-from solidcloud.server.queries.raycast import raycast
-from solidcloud.server.queries.request import EXACT, make_budget
-from solidcloud.server.queries.scene_data import SceneData, make_scene_data, with_stop
-from solidcloud.server.queries.within import within
+from solidcloud.server.queries import rays_and_points
+from solidcloud.server.queries.query_inputs import EXACT, SceneData, make_budget, make_scene_data, with_stop
+from solidcloud.server.queries.rays_and_points import raycast, within
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
@@ -210,15 +208,15 @@ def test_what_is_refused_of_points(noise: Path, points, reach) -> None:  # type:
 @pytest.mark.parametrize("kind", ["raycast", "within"])
 def test_no_batch_begins_after_a_stop(beads: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """The flag is set while the first batch is searched: its answers stay, the others are unknown."""
-    monkeypatch.setattr(nearest_hits, "BATCH", 4)
-    stop, search, calls = StopFlag(), nearest_hits.search_hits, []
+    monkeypatch.setattr(rays_and_points, "BATCH", 4)
+    stop, search, calls = StopFlag(), rays_and_points.search_hits, []
 
     def search_and_stop(*arguments: Any) -> None:
         search(*arguments)
         calls.append(arguments)
         stop.set("test")
 
-    monkeypatch.setattr(nearest_hits, "search_hits", search_and_stop)
+    monkeypatch.setattr(rays_and_points, "search_hits", search_and_stop)
     places, budget = np.tile([1.5, 0.0, 0.0], (11, 1)), EXACT._replace(stop=stop)
     with opened(beads) as data:
         if kind == "raycast":
@@ -239,7 +237,7 @@ def test_a_kernel_searches_nothing_once_it_is_stopped(beads: Path, kind: str) ->
         units = np.rint((places - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
         direction = np.tile(X, (11 if kind == "raycast" else 0, 1))
         batch = HitBatch(units, direction, UNITS_PER_METRE, data.radius_units)
-        lists, best = nearest_hits._list(data, batch), nearest_hits.no_hits(11)
+        lists, best = rays_and_points._list(data, batch), rays_and_points.no_hits(11)
         cursor = lists.starts[:-1].copy()
         for flag in (stop, NO_STOP):
             arrays = with_stop(data, flag).arrays

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.motion import sweep_resident
-from solidcloud.server.queries import one_item as module
+from solidcloud.server.queries import collide as collide_module
+from solidcloud.server.queries import sweep as sweep_module
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.scene_data import SceneData
+from solidcloud.server.queries.query_inputs import SceneData
 from solidcloud.server.queries.sweep import sweep
 
 Poses = NDArray[np.float64]
@@ -32,7 +33,7 @@ def same(data: SceneData, avatar: AvatarModel, first: Poses, last: Poses) -> set
     """Assert that one kernel call says of each motion (k, 4, 4) what `sweep` says; return the verdicts."""
     expected = sweep(data, avatar, first, last)
     for i in range(len(first)):
-        assert said(module.sweep_fast(data, avatar, first[i], last[i]), 0) == said(expected, i)
+        assert said(sweep_module.sweep_fast(data, avatar, first[i], last[i]), 0) == said(expected, i)
     return set(expected.verdict.tolist())
 
 
@@ -52,17 +53,17 @@ def test_motions_and_poses_are_answered_to_the_last_bit(
         found = same(data, avatar, first, last)
         assert Verdict.CONTACT in found
         with monkeypatch.context() as patch:
-            patch.setattr(module, "sweep", None)  # one call answers it
-            assert module.sweep_fast(data, avatar, first[0], last[0]).verdict[0] in found
+            patch.setattr(sweep_module, "sweep", None)  # one call answers it
+            assert sweep_module.sweep_fast(data, avatar, first[0], last[0]).verdict[0] in found
         verdicts = collide(data, avatar, first)
         for i in range(COUNT):
-            one = module.collide_fast(data, avatar, first[i])
+            one = collide_module.collide_fast(data, avatar, first[i])
             assert (one.verdict[0], one.node_visits[0]) == (verdicts.verdict[i], verdicts.node_visits[i])
         region = np.array([[[-(10**6)] * 3, [10**6] * 3]])
         tree = data.tree._replace(unknown=region.astype(np.float64))
         for unseen in (data._replace(unknown_everywhere=True), data._replace(tree=tree)):
             assert Verdict.CLEAR not in same(unseen, avatar, first, last)
-            assert module.collide_fast(unseen, avatar, first[0]).verdict[0] != Verdict.CLEAR
+            assert collide_module.collide_fast(unseen, avatar, first[0]).verdict[0] != Verdict.CLEAR
 
 
 @pytest.mark.interpreted
@@ -89,9 +90,9 @@ def test_a_contact_in_the_first_voxels_needs_no_other(
     with judged_sweeps.opened(case) as data:
         full = collide(data, avatar, touching)
         assert full.verdict[0] == Verdict.CONTACT and full.misses == 1
-        monkeypatch.setattr(module, "collide", None)
-        again = module.collide_fast(data, avatar, touching)
+        monkeypatch.setattr(collide_module, "collide", None)
+        again = collide_module.collide_fast(data, avatar, touching)
         assert again.verdict[0] == Verdict.CONTACT and (again.hits, again.misses) == (1, 0)
         assert again.node_visits[0] == full.node_visits[0]
         with pytest.raises(TypeError):  # not answered by the first voxel alone
-            module.collide_fast(data, avatar, clear, margin=0.1)
+            collide_module.collide_fast(data, avatar, clear, margin=0.1)

@@ -8,15 +8,14 @@ import pytest
 from fake_store import BLOCK, FakeStore
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
-from solidcloud.server.queries.request import EXACT, CostCounter, LateVoxels, QueryBudget
-from solidcloud.server.queries.resolve import (
-    Steps,
+from solidcloud.server.queries.load_and_search import (
     drop_entries,
     drop_items,
     load_and_search,
     resolve,
     run,
 )
+from solidcloud.server.queries.query_inputs import EXACT, CostCounter, LateVoxels, QueryBudget
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import StopFlag
 
@@ -71,6 +70,7 @@ class Table:
     ) -> None:
         """Examine what is held, as a kernel does."""
         self.calls.append((which.tolist(), np.flatnonzero(state == HELD).tolist()))
+        assert set(self.residency._pins) <= set(np.flatnonzero(state).tolist()), "of this slice alone"
         for item in which.tolist():
             while cursor[item] < lists.starts[item + 1]:
                 row = int(lists.rows[cursor[item]])
@@ -99,16 +99,17 @@ def test_every_voxel_of_every_item_is_searched_once_in_its_order(blocks: int, to
         table = Table([1, 2, 1, 2, 1, 1, 2, 1], blocks)
         items = [rng.permutation(8)[: rng.integers(0, 8)].tolist() for _ in range(6)]
         table.load(0, 2)
-        steps = load_and_search(
+        slices = load_and_search(
             table.data, lists_of(items), table.search, EXACT, table.spent, together=together
         )
         while True:
             try:
-                next(steps)
+                next(slices)
             except StopIteration as ended:
                 left = ended.value
                 break
             assert not table.residency._pins, "nothing is held between two slices"
+        assert not table.residency._pins, "nothing is held at the end"
         assert [table.seen.get(i, []) for i in range(6)] == [[(row, HELD) for row in own] for own in items]
         assert (left == np.inf).all()
         distinct = {row for own in items for row in own}
@@ -211,11 +212,10 @@ def test_settle_is_asked_about_absent_voxels_alone(together: bool) -> None:
     table.load(1, 2)
     asked: list[list[list[int]]] = []
 
-    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+    def settle(lists: VoxelLists) -> VoxelLists:
         asked.append(rows_of(lists))
         assert not table.store.loads, "before any load"
         assert bool(table.seen) != together, "what is resident was searched before, unless voxels go together"
-        yield
         return drop_items(lists, np.array([True, False, False]))
 
     lists = lists_of([[0, 1, 3], [2, 4], [1, 2]])
@@ -236,9 +236,8 @@ def test_settle_is_not_asked_after_a_stop(together: bool) -> None:
     if together:
         table.stop.set("")
 
-    def settle(_: VoxelLists) -> Steps[VoxelLists]:
+    def settle(_: VoxelLists) -> VoxelLists:
         raise AssertionError("asked after a stop")
-        yield
 
     lists, budget = lists_of([[0, 1, 2], [3]]), QueryBudget(stop=table.stop)
     left = run(resolve(table.data, lists, table.search, budget, table.spent, settle, together=together))

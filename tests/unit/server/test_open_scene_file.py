@@ -19,8 +19,8 @@ from solidcloud.schemas.errors import (
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ObjectInfo, SceneInfo, SpawnInfo
+from solidcloud.server import open_scene_file
 from solidcloud.server import scene as scene_module
-from solidcloud.server import scene_archives
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
@@ -210,7 +210,7 @@ def test_what_fails_half_way_leaves_no_file_open(
     calls: list[int] = []
     place, _, method = fails.partition(".")
     places = {"Scene": Scene, "PlacedArchive": PlacedArchive, "make_simulation": scene_module}
-    at_fault: Any = places.get(place, scene_archives)
+    at_fault: Any = places.get(place, open_scene_file)
     name = method or place
     right = getattr(at_fault, name)
 

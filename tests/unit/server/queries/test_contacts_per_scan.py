@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from effect_frames import flip_a_byte
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.distance_per_scan import ScanSeparations, separation_per_scan
-from solidcloud.server.queries.request import make_budget
+from solidcloud.server.queries.contacts import ScanSeparations, separation_per_scan
+from solidcloud.server.queries.query_inputs import make_budget
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
 POSE = archive_cases.pose_of(np.eye(3), np.array([0.5, 0.0, 0.13]))

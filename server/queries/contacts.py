@@ -26,7 +26,7 @@ from ..runtime.stop_flag import NO_STOP
 from .collide import drop_clear_of
 from .distance import signed_from_square
 from .level_of_detail import find_level
-from .load_and_search import Slices, answered, resolve
+from .load_and_search import Slices, answered, resolve, run
 from .query_inputs import EXACT, PoseQuery, QueryBudget, SceneData, make_query, to_units, to_world
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
@@ -221,7 +221,7 @@ def separation_per_scan(
     """
     margin_units = to_units(margin, "margin")
     query = make_query(data, avatar, np.asarray(pose)[None], margin_units, budget)
-    memory, tally, left = _gather(query, np.full(1, cells.BY_SCAN), 0, keeps_scan=True)
+    memory, tally, left = run(_gather(query, np.full(1, cells.BY_SCAN), 0, keeps_scan=True))
     missing, visits, tests = tally.counts[:, 0].tolist()
     exact = missing == 0 and min(left[0], query.unseen[0]) == np.inf
     table = memory.cells.table[: memory.sizes[cells.CELLS]]

@@ -249,7 +249,7 @@ class ObjectPush:
             stumbles = swept.cloud is not None and (
                 clear == 0.0 or dot(swept.cloud, self._bodies.up) - low <= _LIFTS[-1]
             )
-        hit = self._others.sweep(self._model, begin, to, _TOLERANCE)
+        hit = self._others.sweep(begin, to, _TOLERANCE)
         if hit is not None and hit.fraction <= clear:
             clear, stumbles = hit.fraction, False
         if clear < 1.0:
@@ -286,7 +286,7 @@ class ObjectPush:
 
     def _is_obstructed(self, pose: Pose) -> bool:
         """Return whether another body obstructs the way from the object's pose to a pose."""
-        return self._others.sweep(self._model, self._pose, pose, _TOLERANCE) is not None
+        return self._others.sweep(self._pose, pose, _TOLERANCE) is not None
 
     def _put_down(self, pose: Pose, rose: float) -> Pose | None:
         """Return the pose that results if the object is lowered; None if it would stand on an edge.
@@ -298,7 +298,7 @@ class ObjectPush:
         up, deep = self._bodies.up, rose + _LIFTS[0]
         down = translated(pose, -deep * up)
         swept = self._world.sweep(self._model, pose, down, _TOLERANCE, self._budget)
-        hit = self._others.sweep(self._model, pose, down, _TOLERANCE)
+        hit = self._others.sweep(pose, down, _TOLERANCE)
         lower = rose
         if swept is not None and swept.verdict == Verdict.CONTACT:
             normal = self._world.normal(swept, _SURFACE, self._budget)

@@ -80,18 +80,11 @@ def _settings(file: SceneFile, up: Vec) -> NDArray[np.void]:
     return made
 
 
-class _NoBodies:
-    """Stand for `Bodies` in `Walker.run`, in a scene without them."""
-
-    lock = nullcontext()
-    bounds, kinds, origin = np.empty((0, 2, 3)), np.empty(0, np.uint8), np.zeros(3)
-
-    def row_of(self, name: str, *, user: bool) -> int:
-        """Return -1."""
-        return -1
-
-
-_NO_BODIES: Any = _NoBodies()
+# Stands for `Bodies` in a scene without them.
+_NO_BODIES: Any = SimpleNamespace(
+    lock=nullcontext(), bounds=np.empty((0, 2, 3)), kinds=np.empty(0, np.uint8), origin=np.zeros(3),
+    row_of=lambda name, *, user: -1,
+)  # fmt: skip
 
 
 class FrameMemory(threading.local):

@@ -33,7 +33,7 @@ from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.request import QueryBudget
 from ...queries.scene_data import to_units
-from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
+from ..world.bodies import KINEMATIC, PUSHED, SURFACE_REACH, USER, Bodies, BodyObstacle, warm_kernels
 from ..world.frame import Body, Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 
 # Largest permitted margin of `crowd` [m].
@@ -53,8 +53,6 @@ _HEAD_ON_COSINE = 0.5
 _LIFTS = (0.005, 0.01, 0.02)
 # A pushed object that is this far above the floor, or less, is not put down [m].
 _PUT_DOWN = 1e-3
-# Points within this distance determine the normal of a touched surface [m].
-_SURFACE = 0.08
 # A contact opposes a push if the push leads into its surface at more than 6 degrees. Normals of
 # floors with noise are wrong by a few degrees.
 _OPPOSES = 0.1
@@ -272,7 +270,7 @@ class ObjectPush:
             hit = self._world.deepest(self._model, pose, self._budget) if verdict == Verdict.CONTACT else None
             if hit is None or hit.avatar is None or hit.cloud is None:
                 return None
-            out = self._world.normal(hit, _SURFACE, self._budget)
+            out = self._world.normal(hit, SURFACE_REACH, self._budget)
             if out is None:
                 out = hit.avatar - hit.cloud
             if (
@@ -301,7 +299,7 @@ class ObjectPush:
         hit = self._others.sweep(pose, down, _TOLERANCE)
         lower = rose
         if swept is not None and swept.verdict == Verdict.CONTACT:
-            normal = self._world.normal(swept, _SURFACE, self._budget)
+            normal = self._world.normal(swept, SURFACE_REACH, self._budget)
             if normal is not None and dot(normal, up) < _LEVEL:
                 return None
         stops = [each.fraction for each in (swept, hit) if each is not None]

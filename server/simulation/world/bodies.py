@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.rigid_pose import rigid_pose
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_table import Slide
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
 from ...kernels.bodies.body_pairs import CONTACT, bound_body, find_near_bodies, touch_pairs
@@ -38,9 +39,8 @@ from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Frame, Hit, Pose, Vec, dot, horizontal, norm, rotate, rotate_back
 
 USER, KINEMATIC, PUSHED = 1, 2, 4  # kinds, one bit each
-# Points within this distance determine the normal of a body's surface [m]; `slide` and `ground` use
-# the same distance for scans.
-_SURFACE = 0.08
+# Points within this distance determine the normal of a surface [m], as `slide` has it unless told otherwise.
+SURFACE_REACH = Slide().normal_reach
 # Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
 _MAX_LOOSE_SHAPES = 64
 # Tolerance for a translation across an overlapped body, so that rounding does not count as deeper.
@@ -71,7 +71,7 @@ class Shape(NamedTuple):
         if point not in self.normals:
             points = self.model.points
             apart = points[: len(points) - self.model.inner_points] - points[point]
-            near = np.rint(apart[(apart * apart).sum(axis=1) <= _SURFACE**2] * UNITS_PER_METRE).astype(
+            near = np.rint(apart[(apart * apart).sum(axis=1) <= SURFACE_REACH**2] * UNITS_PER_METRE).astype(
                 np.int64
             )
             x, y, z = near.T

@@ -103,7 +103,6 @@ def _difference(logged: LoggedTurn, outcome: FrameResult) -> str:
 
 
 def _describe(pose: Rows | None, error: str) -> str:
-    """Describe the result of a turn."""
     if pose is None:
         return f"error {error}"
     x, y, z = (row[3] for row in pose[:3])
@@ -198,5 +197,4 @@ def check_same(head: LogHead, simulation: Simulation, path: Path) -> bool:
 
 
 def _describe_archives(archives: Sequence[tuple[str, int]]) -> str:
-    """Describe archives."""
     return " and ".join(f"archive {name[:8]} of generation {generation}" for name, generation in archives)

@@ -317,7 +317,6 @@ class Simulation:
         return _make_body(user, avatar, first_pose(command, self.file.spawn, self._up))
 
     def _remove(self, users: list[User]) -> None:
-        """Remove the bodies of users."""
         users = [user for user in users if user in self._present]
         for user in users:
             del self._present[user]
@@ -514,7 +513,7 @@ class Pipeline:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)
             # Bodies that overlap the avatar since the frame's start, such as a placed object, do
             # not block it, but the verdict reports them.
-            if not frame.apart and any([each.overlaps(body.avatar, frame.pose) for each in frame.obstacles]):
+            if not frame.apart and any([each.overlaps(frame.pose) for each in frame.obstacles]):
                 frame.verdict = Verdict.CONTACT
             if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError

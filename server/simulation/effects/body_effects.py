@@ -32,7 +32,7 @@ from ....schemas.scene.effect_table import Crowd, Objects
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.query_inputs import QueryBudget, to_units
-from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies, BodyObstacle, warm_kernels
+from ..world.bodies import KINEMATIC, PUSHED, SURFACE_REACH, USER, Bodies, BodyObstacle, warm_kernels
 from ..world.frame import Body, Frame, Hit, Pose, Run, Vec, dot, horizontal, lowest_height, norm, translated
 
 # Largest permitted margin of `crowd` [m].
@@ -52,8 +52,6 @@ _HEAD_ON_COSINE = 0.5
 _LIFTS = (0.005, 0.01, 0.02)
 # A pushed object that is this far above the floor, or less, is not put down [m].
 _PUT_DOWN = 1e-3
-# Points within this distance determine the normal of a touched surface [m].
-_SURFACE = 0.08
 # A contact opposes a push if the push leads into its surface at more than 6 degrees. Normals of
 # floors with noise are wrong by a few degrees.
 _OPPOSES = 0.1
@@ -248,7 +246,7 @@ class ObjectPush:
             stumbles = swept.cloud is not None and (
                 clear == 0.0 or dot(swept.cloud, self._bodies.up) - low <= _LIFTS[-1]
             )
-        hit = self._others.sweep(self._model, begin, to, _TOLERANCE)
+        hit = self._others.sweep(begin, to, _TOLERANCE)
         if hit is not None and hit.fraction <= clear:
             clear, stumbles = hit.fraction, False
         if clear < 1.0:
@@ -271,7 +269,7 @@ class ObjectPush:
             hit = self._world.deepest(self._model, pose, self._budget) if verdict == Verdict.CONTACT else None
             if hit is None or hit.avatar is None or hit.cloud is None:
                 return None
-            out = self._world.normal(hit, _SURFACE, self._budget)
+            out = self._world.normal(hit, SURFACE_REACH, self._budget)
             if out is None:
                 out = hit.avatar - hit.cloud
             if (
@@ -285,7 +283,7 @@ class ObjectPush:
 
     def _is_obstructed(self, pose: Pose) -> bool:
         """Return whether another body obstructs the way from the object's pose to a pose."""
-        return self._others.sweep(self._model, self._pose, pose, _TOLERANCE) is not None
+        return self._others.sweep(self._pose, pose, _TOLERANCE) is not None
 
     def _put_down(self, pose: Pose, rose: float) -> Pose | None:
         """Return the pose that results if the object is lowered; None if it would stand on an edge.
@@ -297,10 +295,10 @@ class ObjectPush:
         up, deep = self._bodies.up, rose + _LIFTS[0]
         down = translated(pose, -deep * up)
         swept = self._world.sweep(self._model, pose, down, _TOLERANCE, self._budget)
-        hit = self._others.sweep(self._model, pose, down, _TOLERANCE)
+        hit = self._others.sweep(pose, down, _TOLERANCE)
         lower = rose
         if swept is not None and swept.verdict == Verdict.CONTACT:
-            normal = self._world.normal(swept, _SURFACE, self._budget)
+            normal = self._world.normal(swept, SURFACE_REACH, self._budget)
             if normal is not None and dot(normal, up) < _LEVEL:
                 return None
         stops = [each.fraction for each in (swept, hit) if each is not None]

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.rigid_pose import rigid_pose
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_table import Slide
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
 from ...kernels.bodies.body_pairs import CONTACT, bound_body, find_near_bodies, touch_pairs
@@ -37,9 +38,8 @@ from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Frame, Hit, Pose, Vec, dot, horizontal, norm, rotate, rotate_back
 
 USER, KINEMATIC, PUSHED = 1, 2, 4  # kinds, one bit each
-# Points within this distance determine the normal of a body's surface [m]; `slide` and `ground` use
-# the same distance for scans.
-_SURFACE = 0.08
+# Points within this distance determine the normal of a surface [m], as `slide` has it unless told otherwise.
+SURFACE_REACH = Slide().normal_reach
 # Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
 _MAX_LOOSE_SHAPES = 64
 # Tolerance for a translation across an overlapped body, so that rounding does not count as deeper.
@@ -70,7 +70,7 @@ class Shape(NamedTuple):
         if point not in self.normals:
             points = self.model.points
             apart = points[: len(points) - self.model.inner_points] - points[point]
-            near = np.rint(apart[(apart * apart).sum(axis=1) <= _SURFACE**2] * UNITS_PER_METRE).astype(
+            near = np.rint(apart[(apart * apart).sum(axis=1) <= SURFACE_REACH**2] * UNITS_PER_METRE).astype(
                 np.int64
             )
             x, y, z = near.T
@@ -150,7 +150,7 @@ class Bodies:
                 self._add(body.name, USER, body.avatar, body.pose)
                 return
             self.shapes[row] = self.shape_of(body.avatar)
-            self._put(row, body.pose)
+            self.put(row, body.pose)
 
     def remove_user(self, name: str) -> None:
         """Remove a user, if it is present; the numbers of later rows decrease by one."""
@@ -187,7 +187,7 @@ class Bodies:
         self.bounds = np.concatenate([self.bounds, np.zeros((1, 2, 3))])
         self._rows[kind == USER, name] = row
         self.layout += 1
-        self._put(row, pose, begun=True)
+        self._set(row, pose)
 
     # --- poses ---------------------------------------------------------------------------------
 
@@ -202,7 +202,7 @@ class Bodies:
         def restore() -> None:
             with self.lock:
                 for row in np.flatnonzero((poses != self.poses).any(axis=(1, 2))).tolist():
-                    self._put(row, poses[row])
+                    self.put(row, poses[row])
                 self._came_from = came_from
 
         return restore
@@ -210,21 +210,19 @@ class Bodies:
     def put(self, row: int, pose: Pose) -> None:
         """Set the pose of a body."""
         with self.lock:
-            self._put(row, pose)
+            if (self.poses[row] != pose).any():
+                self._set(row, pose)
+                self.clock += 1
+                self.changed[row] = self.clock
 
-    def _put(self, row: int, pose: Pose, begun: bool = False) -> None:
-        """Implement `put`. begun: the body is new."""
-        if not begun and (self.poses[row] == pose).all():
-            return
+    def _set(self, row: int, pose: Pose) -> None:
+        """Set the pose of a body and its bounds."""
         self.poses[row] = pose
-        shape = self.shapes[row]
-        if len(shape.model.points):
-            bound_body(shape.model.box, self.poses[row], self.origin, shape.model.radius, self.bounds[row])
+        model = self.shapes[row].model
+        if len(model.points):
+            bound_body(model.box, self.poses[row], self.origin, model.radius, self.bounds[row])
         else:
             self.bounds[row, 0], self.bounds[row, 1] = np.inf, -np.inf
-        if not begun:
-            self.clock += 1
-            self.changed[row] = self.clock
 
     def place_objects(self, poses: Mapping[str, Sequence[Sequence[float]]], stop: StopFlag = NO_STOP) -> None:
         """Place objects where a motion command puts them, even into users.
@@ -240,7 +238,7 @@ class Bodies:
             ]
             for row, pose in checked:
                 before = self.poses[row].copy()
-                self._put(row, pose)
+                self.put(row, pose)
                 self._remember_origin(row, before, stop)
 
     def _kinematic_row(self, name: str) -> int:
@@ -345,31 +343,27 @@ class BodyObstacle:
         """
         return math.inf if any(self._overlapped.values()) else self.margin_units / UNITS_PER_METRE
 
-    def sweep(
-        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
-    ) -> Hit | None:
-        """Return the hit that ends the motion first; of equals, that of the lowest row; None if none does.
+    def sweep(self, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False) -> Hit | None:
+        """Return the hit that ends a motion first; of equals, that of the lowest row; None if none does.
 
         Nothing is touched before the hit's fraction.
         below: leave out bodies beside the avatar.
         """
-        bodies = self.bodies
-        with bodies.lock:
-            shape = bodies.shape_of(avatar)
+        with self.bodies.lock:
             ends = self._from_origin(pose_from), self._from_origin(pose_to)
-            rows = self._near(shape, pose_from, pose_to)
+            rows = self._near(pose_from, pose_to)
             if below and len(rows):
-                rows = rows[~self._beside(shape, pose_from, rows)]
+                rows = rows[~self._beside(pose_from, rows)]
             while len(rows):
-                row, first = self._first(shape, ends, rows, tolerance)
+                row, first = self._first(ends, rows, tolerance)
                 if first is None:
                     break
                 if first.fraction > 0.0 or not self._is_overlapped(row):
-                    return self._deepening_hit(shape, pose_from, pose_to) or first
+                    return self._deepening_hit(pose_from, pose_to) or first
                 rows = rows[rows != row]
-            return self._deepening_hit(shape, pose_from, pose_to)
+            return self._deepening_hit(pose_from, pose_to)
 
-    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+    def touches(self, pose: Pose) -> Hit | None:
         """Return the hit of the touched body with the lowest row; None if no body is touched.
 
         `avatar` and `cloud` of the hit are the two bodies' centres at the same height: the contact point
@@ -377,64 +371,59 @@ class BodyObstacle:
         """
         bodies = self.bodies
         with bodies.lock:
-            shape = bodies.shape_of(avatar)
-            rows = self._near(shape, pose, pose)
+            shape, rows = self._shape, self._near(pose, pose)
             if len(rows):
                 rows = rows[bodies.touching(shape, pose, rows, self.margin_units, self._stop)]
             for row in rows.tolist():
                 if not self._is_overlapped(row):
                     out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
                     return self._hit(row, shape.center(pose), horizontal(out, bodies.up))
-            return self._deepening_hit(shape, self._start, pose)
+            return self._deepening_hit(self._start, pose)
 
-    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
+    def overlaps(self, pose: Pose) -> bool:
         """Return whether any body is touched at a pose, without the margin.
 
         Bodies that were touched when the frame began count too.
         """
         bodies = self.bodies
         with bodies.lock:
-            shape = bodies.shape_of(avatar)
-            rows = self._in_reach(shape, pose, pose)
-            return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
+            rows = self._in_reach(pose, pose)
+            return bool(len(rows) and bodies.touching(self._shape, pose, rows, 0, self._stop).any())
 
-    def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+    @property
+    def _shape(self) -> Shape:
+        """Return the shape of the mover."""
+        return self.bodies.shape_of(self._model)
+
+    def _in_reach(self, first: Pose, last: Pose) -> NDArray[np.int64]:
         """Return the rows (m,) whose bounds a motion may touch."""
-        bodies = self.bodies
+        bodies, model = self.bodies, self._model
         rows = np.empty(len(bodies.names), np.int64)
-        if not len(rows) or not len(shape.model.points):
+        if not len(rows) or not len(model.points):
             return rows[:0]
         own = bodies.row_of(self._mover, user=self._user)
-        more = shape.model.radius + self.margin_units / UNITS_PER_METRE
+        more = model.radius + self.margin_units / UNITS_PER_METRE
         count = find_near_bodies(
-            shape.model.box,
-            np.ascontiguousarray(first),
-            np.ascontiguousarray(last),
-            bodies.origin,
-            more,
-            bodies.bounds,
-            bodies.kinds,
-            self.wanted,
-            own,
-            rows,
-        )
+            model.box, np.ascontiguousarray(first), np.ascontiguousarray(last), bodies.origin, more,
+            bodies.bounds, bodies.kinds, self.wanted, own, rows,
+        )  # fmt: skip
         return rows[:count]
 
-    def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+    def _near(self, first: Pose, last: Pose) -> NDArray[np.int64]:
         """Return the rows of `_in_reach`, except those overlapped when the frame began."""
         bodies = self.bodies
         if self._layout != bodies.layout:
             self._layout, self._overlapped = bodies.layout, {}
-        found = self._in_reach(shape, first, last)
+        found = self._in_reach(first, last)
         left_out = [row for row, overlapped in self._overlapped.items() if overlapped]
         if self._skip:
             left_out.append(bodies.row_of(self._skip, user=True))
         return found[~np.isin(found, left_out)] if len(found) and left_out else found
 
-    def _beside(self, shape: Shape, pose: Pose, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _beside(self, pose: Pose, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which bodies (m,) stand beside the avatar: their tops are above the middle of its height."""
-        bodies, own = self.bodies, np.empty((2, 3))
-        bound_body(shape.model.box, np.ascontiguousarray(pose), bodies.origin, shape.model.radius, own)
+        bodies, model, own = self.bodies, self._model, np.empty((2, 3))
+        bound_body(model.box, np.ascontiguousarray(pose), bodies.origin, model.radius, own)
         tops = np.maximum(bodies.bounds[rows, 0] * bodies.up, bodies.bounds[rows, 1] * bodies.up).sum(axis=1)
         heights = np.sort(own * bodies.up, axis=0).sum(axis=1)
         beside: NDArray[np.bool_] = tops > heights.mean()
@@ -447,13 +436,13 @@ class BodyObstacle:
         return there
 
     def _first(
-        self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
+        self, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
     ) -> tuple[int, Hit | None]:
         """Return the first hit of a motion with the bodies of rows (m,) and its row, or None.
 
         ends: poses from the bodies' origin.
         """
-        bodies = self.bodies
+        bodies, shape = self.bodies, self._shape
         row, point, fraction, witness = -1, 0, np.inf, np.empty((2, 3))
         for other, places in bodies.by_shape(rows):
             centers, named = np.empty((2, 3)), np.empty(2, np.int64)
@@ -479,21 +468,21 @@ class BodyObstacle:
         """Return whether the mover touched a body when the frame began."""
         found = self._overlapped.get(row)
         if found is None:
-            bodies = self.bodies
-            shape = bodies.shape_of(self._model)
-            touching = bodies.touching(shape, self._start, np.array([row]), self.margin_units, self._stop)
+            touching = self.bodies.touching(
+                self._shape, self._start, np.array([row]), self.margin_units, self._stop
+            )
             found = self._overlapped[row] = bool(touching[0])
         return found
 
-    def _deepening_hit(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
+    def _deepening_hit(self, pose_from: Pose, pose_to: Pose) -> Hit | None:
         """Return a hit if a motion leads deeper into a body that was overlapped at the start.
 
         It does if its translation is directed against the body's way out. Return None otherwise.
         """
-        way, bodies = pose_to[:3, 3] - pose_from[:3, 3], self.bodies
+        way, shape = pose_to[:3, 3] - pose_from[:3, 3], self._shape
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
-            center = bodies.shape_of(self._model).center(self._start)
-            out = bodies.escape_direction(row, self._mover if self._user else "", center)
+            user = self._mover if self._user else ""
+            out = self.bodies.escape_direction(row, user, shape.center(self._start))
             if dot(way, out) < -_ACROSS * norm(out) * norm(way):
                 return self._hit(row, shape.center(pose_from), out)
         return None
@@ -514,6 +503,6 @@ def warm_kernels() -> None:
     for name, pose in zip("ab", poses, strict=True):
         bodies.put_user(Body(name, model, pose))
     blocking = BodyObstacle(bodies, USER, Body("a", model, poses[0]))
-    blocking.sweep(model, poses[0], poses[1], 1e-6)
-    blocking.touches(model, poses[1])
+    blocking.sweep(poses[0], poses[1], 1e-6)
+    blocking.touches(poses[1])
     bodies.shape_of(model).normal_at(0)

@@ -47,7 +47,7 @@ _NO_ORIGIN = np.zeros(3)
 # normal is multiplied by this factor.
 SPARSE_FACTOR = 3.0
 # `Verdict` of its number: making one takes as long as a fifth of a query.
-_VERDICTS = {int(verdict): verdict for verdict in Verdict}
+VERDICTS = {int(verdict): verdict for verdict in Verdict}
 _CLEAR, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.UNKNOWN)
 
 
@@ -202,7 +202,7 @@ class World:
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
         """Return the verdict at a pose (4, 4) over all archives; see server/queries/collide.py."""
         answers, _ = self._ask_avatar(collide_fast, avatar, (pose,), (0.0,), budget)
-        return _VERDICTS[answers.verdict.item(0)]
+        return VERDICTS[answers.verdict.item(0)]
 
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
@@ -245,7 +245,7 @@ class World:
         )
         if found.distance[0] == np.inf:
             return None
-        return Hit(0.0, _VERDICTS[found.verdict.item(0)], None, found.cloud_point[0], "", number)
+        return Hit(0.0, VERDICTS[found.verdict.item(0)], None, found.cloud_point[0], "", number)
 
     def sweep(
         self,
@@ -263,7 +263,7 @@ class World:
         found, number = self._ask_avatar(
             sweep_fast, avatar, (pose_from, pose_to), (0.0, tolerance), budget, *names
         )
-        verdict, exact = _VERDICTS[found.verdict.item(0)], found.exact.item(0)
+        verdict, exact = VERDICTS[found.verdict.item(0)], found.exact.item(0)
         if not exact:
             with self as held:  # a stop may leave places unexamined too
                 self.count(0, bool(budget.stop) or any(has_unknown(each.data) for each in held))

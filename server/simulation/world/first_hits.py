@@ -243,7 +243,7 @@ def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, be
     """
     found = None
     for obstacle in frame.obstacles:
-        hit = obstacle.sweep(frame.body.avatar, frame.pose, to, tolerance, below=below)
+        hit = obstacle.sweep(frame.pose, to, tolerance, below=below)
         if hit is not None and hit.fraction < until:
             found, until = hit, hit.fraction
     return found
@@ -257,7 +257,7 @@ def find_touched(frame: Frame, pose: Pose) -> Hit | None:
         return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
     if verdict == Verdict.UNKNOWN:
         return Hit(0.0, verdict, None, None, unloaded=frame.lacked > lacked)
-    return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
+    return next((hit for each in frame.obstacles if (hit := each.touches(pose))), None)
 
 
 def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
@@ -273,7 +273,7 @@ def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
 
 def touches_bodies(frame: Frame, pose: Pose) -> bool:
     """Return whether an obstacle is touched at a pose."""
-    return any(each.touches(frame.body.avatar, pose) for each in frame.obstacles)
+    return any(each.touches(pose) for each in frame.obstacles)
 
 
 def max_displacement(frame: Frame, to: Pose) -> float:

@@ -26,16 +26,13 @@ from ...kernels.walk.motions import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
 from ...queries.collide import MAX_FAST_POINTS
 from ...queries.query_inputs import EXACT
-from .collision_world import SPARSE_FACTOR, World, normals_of
+from .collision_world import SPARSE_FACTOR, VERDICTS, World, normals_of
 from .first_hits import find_first_hit, find_touched, first_body_hit, is_clear, touches_bodies
 from .frame import GROUND_PLANE, RAISED, Frame, Hit, Pose, Vec, dot, lowest_height, translated
 
 # Parts of a frame that effects run.
 FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND
 _NO_SQUARES = np.zeros(3, np.int64)
-# Points within this distance of the touched point determine the ground's normal [m], unless `slide`
-# names another.
-_NORMAL_REACH = 0.08
 # The first search for ground extends this many clearances down.
 _NEAR_CLEARANCES = 2.0
 # Least distance to move off a bump [m].
@@ -50,7 +47,6 @@ _ROWS = 64
 # A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
 # tolerance of that sweep [m].
 _FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
-_VERDICTS = {int(verdict): verdict for verdict in Verdict}
 
 
 def _fields_of(records: NDArray[np.void]) -> Any:
@@ -61,14 +57,13 @@ def _fields_of(records: NDArray[np.void]) -> Any:
 def _settings(file: SceneFile, up: Vec) -> NDArray[np.void]:
     """Return the options of a scene's effects for the kernel, one record."""
     declared: dict[type, Any] = {type(effect): effect for effect in file.effects}
-    stop, slide = declared.get(Stop, Stop()), declared.get(Slide)
+    stop, slide = declared.get(Stop, Stop()), declared.get(Slide, Slide())
     ground, step = declared.get(Ground), declared.get(Step)
     height = 0.0 if step is None else step.height
     made = np.zeros(1, state.SETTINGS)
-    made["up"], made["continuous"], made["slides"] = up, Sweep in declared, slide is not None
+    made["up"], made["continuous"], made["slides"] = up, Sweep in declared, Slide in declared
     made["skin"], made["tolerance"], made["step"] = stop.skin, sweep_tolerance(file), height
-    made["surfaces"] = 4 if slide is None else slide.surfaces
-    made["normal_reach"] = _NORMAL_REACH if slide is None else slide.normal_reach
+    made["surfaces"], made["normal_reach"] = slide.surfaces, slide.normal_reach  # the latter for `ground` too
     made["lift"], made["walkable_slide"] = max(stop.skin, _MIN_LIFT), -2.0
     if ground is not None:
         walkable, clearance = math.cos(math.radians(ground.slope)), ground.clearance
@@ -80,18 +75,11 @@ def _settings(file: SceneFile, up: Vec) -> NDArray[np.void]:
     return made
 
 
-class _NoBodies:
-    """Stand for `Bodies` in `Walker.run`, in a scene without them."""
-
-    lock = nullcontext()
-    bounds, kinds, origin = np.empty((0, 2, 3)), np.empty(0, np.uint8), np.zeros(3)
-
-    def row_of(self, name: str, *, user: bool) -> int:
-        """Return -1."""
-        return -1
-
-
-_NO_BODIES: Any = _NoBodies()
+# Stands for `Bodies` in a scene without them.
+_NO_BODIES: Any = SimpleNamespace(
+    lock=nullcontext(), bounds=np.empty((0, 2, 3)), kinds=np.empty(0, np.uint8), origin=np.zeros(3),
+    row_of=lambda name, *, user: -1,
+)  # fmt: skip
 
 
 class FrameMemory(threading.local):
@@ -170,7 +158,7 @@ class WalkCall:
         """Read the state that a frame has reached."""
         frame, now = self._frame, self._thread.state
         frame.pose = self._thread.memory.poses[0].copy()
-        frame.verdict, frame.clear = _VERDICTS[now.verdict.item()], now.clear.item()
+        frame.verdict, frame.clear = VERDICTS[now.verdict.item()], now.clear.item()
         frame.remaining = now.left[0].copy()
         frame.hits = [self._read_hit(number) for number in range(now.hits.item())]
         stepped = now.stepped.item()
@@ -299,7 +287,7 @@ class WalkCall:
         known, has_pair = self._hits.get(row), tape.has_pair.item(row)
         return Hit(
             tape.lower.item(row),
-            _VERDICTS[tape.verdict.item(row)],
+            VERDICTS[tape.verdict.item(row)],
             tape.avatar[row].copy() if has_pair else None,
             tape.cloud[row].copy() if has_pair else None,
             "" if known is None else known.what,

@@ -126,11 +126,9 @@ class MaskedStore(VoxelStore):
             found += int(self.archive.voxels["rows"][row, 2]) - int(blocks[:, 3].sum())
         return found
 
-    def decode(
-        self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
-    ) -> NDArray[np.int64]:
-        """Lay out a voxel as `VoxelStore.decode` does, without the points inside the boxes."""
-        where = super().decode(row, frames, arena, offset)
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Read and lay out a voxel as `VoxelStore.load` does, without the points inside the boxes."""
+        where = super().load(row, arena, offset)
         if self._meets[row]:
             self._mask(row, arena, where)
         return where

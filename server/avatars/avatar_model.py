@@ -46,14 +46,9 @@ _PAIRS = 1 << 18
 # times as long near a scan, and `collide` 0.8 to 1.2 times (bench_engine, `filled`).
 FILLED_FRONT = 32
 # Arrays of an avatar without points.
+_NO_NODES = np.empty(0, np.int32)
 _EMPTY = Avatar(
-    np.empty((0, 3)),
-    np.empty(0),
-    *[np.empty(0, np.int32)] * 2,
-    np.empty((0, 3, LANES)),
-    np.empty((4, 0)),
-    0,
-    0,
+    np.empty((0, 3)), np.empty(0), _NO_NODES, _NO_NODES, np.empty((0, 3, LANES)), np.empty((4, 0)), 0, 0
 )
 
 
@@ -121,10 +116,12 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
     arrays, bounding_radius, box = _EMPTY, 0.0, np.zeros((2, 3))
     if len(array):
         tree = pack_points(array)
-        if radius is None and (radius := mean_spacing(tree) / 2) == 0.0:
-            raise BadRequestError(
-                "avatar of a single distinct point has no closest-point distance: give a radius"
-            )
+        if radius is None:
+            radius = mean_spacing(tree) / 2
+            if radius == 0.0:
+                raise BadRequestError(
+                    "avatar of a single distinct point has no closest-point distance: give a radius"
+                )
         arrays, rows = _lay_out(tree, array, inner_points)
         bounding_radius = float(arrays.radius[0]) + float(radius)
         box = np.array([array.min(axis=0), array.max(axis=0)])

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -445,13 +446,7 @@ class Prefetcher:
 
     def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:
         """Select rows, soonest needed first, that fit together in KEPT_SHARE of the budget."""
-        left = int(KEPT_SHARE * self._residency.budget_bytes)
-        if self._residency.bytes_of(rows) <= left:
-            return frozenset(rows)
-        kept = []
-        for row in sorted(rows, key=lambda row: need.get(row, math.inf)):
-            left -= self._residency.bytes_of([row])
-            if left < 0:
-                break
-            kept.append(row)
-        return frozenset(kept)
+        rows = sorted(rows, key=lambda row: need.get(row, math.inf))
+        taken = accumulate(self._residency.bytes_of([row]) for row in rows)
+        share = KEPT_SHARE * self._residency.budget_bytes
+        return frozenset(row for row, size in zip(rows, taken, strict=True) if size <= share)

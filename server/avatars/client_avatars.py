@@ -4,9 +4,9 @@ import threading
 import time
 from collections.abc import Collection
 from contextlib import nullcontext
-from typing import NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ...schemas.wire.encoding import avatar_digest
@@ -35,17 +35,6 @@ class _Entry:
 
     def __init__(self, model: AvatarModel, asked: float | None, size: int) -> None:
         self.model, self.asked, self.bytes, self.used = model, asked, size, time.monotonic()
-
-
-class _Totals(NamedTuple):
-    """Totals over the avatars of all clients.
-
-    bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
-    """
-
-    bytes: int
-    avatars: int
-    clients: int
 
 
 def check_owner(client: str) -> None:
@@ -171,9 +160,9 @@ class Avatars:
         """Return the memory and number of all clients' avatars, and the limits."""
         limits, totals = self.limits, self._totals()
         if limits is None:
-            return AvatarStats(*totals)
-        return AvatarStats(
-            *totals,
+            return totals
+        return structs.replace(
+            totals,
             max_bytes=limits.bytes,
             max_bytes_by_client=limits.bytes_by_client,
             max_avatars=limits.avatars,
@@ -181,11 +170,12 @@ class Avatars:
             max_clients=limits.clients,
         )
 
-    def _totals(self) -> _Totals:
+    def _totals(self) -> AvatarStats:
+        """Return the bytes and numbers of all clients' avatars, without the limits."""
         with self._lock:
             own = [entries for client, entries in self._clients.items() if client not in _OWN]
             each = [entry.bytes for entries in own for entry in entries.values()]
-        return _Totals(sum(each), len(each), len(own))
+        return AvatarStats(sum(each), len(each), len(own))
 
     def _check_room(self, name: str, client: str, count: int, size: int) -> None:
         """Raise TooLargeError if an avatar of `count` points and `size` bytes more exceeds the limits."""

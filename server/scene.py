@@ -349,7 +349,7 @@ class Scene(QueryMethods):
         """
         shape = avatar_shape(points, radius, up=up, units=units, scale=scale, hollow=hollow)
         request = AddAvatarRequest(name, make_positions(shape.points), shape.radius, shape.inner_points)
-        model = self._avatars.add(name, request.points, request.radius, client, request.inner_points)
+        model = self._avatars.add(request, client)
         return describe_avatar(name, model, shape.description)
 
     def avatar(self, name: str, client: str) -> AvatarModel:

@@ -199,19 +199,13 @@ class Archive:
                 (self.shard_path(int(self.voxels["shard"][row])),),
             ) from error
 
-    def open_voxel(
-        self,
-        row: int,
-        frames: tuple[bytes, bytes, bytes] | None = None,
-        columns: Collection[str] = OPTIONAL_COLUMNS,
-    ) -> DecompressedRecord:
+    def open_voxel(self, row: int, columns: Collection[str] = OPTIONAL_COLUMNS) -> DecompressedRecord:
         """Decompress the voxel in index row `row`; its points stay unread.
 
-        frames: the voxel's frames if they have been read already.
         columns: optional columns to decompress.
         Raises CorruptError naming the location.
         """
-        frames = frames or self.read_frames(row)
+        frames = self.read_frames(row)
         with self.locating(row):
             return decompress_record(
                 *frames,

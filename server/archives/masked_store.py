@@ -54,33 +54,30 @@ class MaskedStore(VoxelStore):
         self._boxes = [np.asarray(box, np.float64) for box in boxes]
         self._pose = archive_pose(pose)
         super().__init__(folder)
+        archive, steps = self.archive, self.archive.header.lattice.voxel_steps
+        base = archive.coordinates * steps
         try:
-            meets, is_inside = self._find_voxels()
-            if is_inside.all():
+            # A voxel inside is never read, so nothing would show that its box in the index is too small:
+            # its whole cell counts.
+            kept = ~self._are_inside(*self._world_boxes(base, base + (steps - 1)))
+            if not kept.any():
                 raise BadRequestError(
                     f"{folder}: the boxes of the effect `through` contain all of its points: leave the archive out of "
                     "the scene, or give smaller boxes"
                 )
+            self._meets = self._meets_box(base + archive.voxels["low"], base + archive.voxels["high"])[kept]
         except BaseException:
             self.close()
             raise
-        archive, kept = self.archive, ~is_inside
         archive.voxels, archive.coordinates = archive.voxels[kept], archive.coordinates[kept]
-        self.sizes, self._meets = self.sizes[kept], meets[kept]
+        self.sizes = self.sizes[kept]
 
-    def _find_voxels(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which voxels (v,) have points in a box, perhaps, and which lie inside one.
-
-        For "inside", the voxel's whole cell counts: the voxel is never read, so nothing would show that
-        its box in the index is too small.
-        """
-        voxels, steps = self.archive.voxels, self.archive.header.lattice.voxel_steps
-        base = self.archive.coordinates * steps
-        low, high = self._world_boxes(base, base + (steps - 1))
-        is_inside = np.zeros(len(base), bool)
+    def _are_inside(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which world boxes, low and high (n, 3) each, lie inside a box [m]."""
+        found = np.zeros(len(low), bool)
         for least, greatest in self._boxes:
-            is_inside |= ((low >= least) & (high <= greatest)).all(axis=1)
-        return self._meets_box(base + voxels["low"], base + voxels["high"]), is_inside
+            found |= ((low >= least) & (high <= greatest)).all(axis=1)
+        return found
 
     def _meets_box(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which lattice boxes, low and high (n, 3) each, may have points in a box."""
@@ -107,11 +104,8 @@ class MaskedStore(VoxelStore):
     ) -> NDArray[np.bool_]:
         """Return which spheres (n,) lie in a box. points: (n, 3), archive frame [m].  radii: (n,) [m]."""
         world = points if self._pose is None else transform_points(self._pose, points)
-        around = np.broadcast_to(np.asarray(radii)[..., None], world.shape)
-        found = np.zeros(len(world), bool)
-        for low, high in self._boxes:
-            found |= ((world - around >= low) & (world + around <= high)).all(axis=1)
-        return found
+        around = np.asarray(radii)[..., None]
+        return self._are_inside(world - around, world + around)
 
     def count_hidden(self) -> int:
         """Return the number of points in the boxes. Raise CorruptError or OSError.
@@ -126,11 +120,9 @@ class MaskedStore(VoxelStore):
             found += int(self.archive.voxels["rows"][row, 2]) - int(blocks[:, 3].sum())
         return found
 
-    def decode(
-        self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
-    ) -> NDArray[np.int64]:
-        """Lay out a voxel as `VoxelStore.decode` does, without the points inside the boxes."""
-        where = super().decode(row, frames, arena, offset)
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Read and lay out a voxel as `VoxelStore.load` does, without the points inside the boxes."""
+        where = super().load(row, arena, offset)
         if self._meets[row]:
             self._mask(row, arena, where)
         return where

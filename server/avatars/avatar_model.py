@@ -45,6 +45,25 @@ _PAIRS = 1 << 18
 # Largest front of a filled mesh, most of whose nodes are inside. With 256, `distance` takes 1.2
 # times as long near a scan, and `collide` 0.8 to 1.2 times (bench_engine, `filled`).
 FILLED_FRONT = 32
+# Arrays of an avatar without points.
+_NO_NODES = np.empty(0, np.int32)
+_EMPTY = Avatar(
+    np.empty((0, 3)), np.empty(0), _NO_NODES, _NO_NODES, np.empty((0, 3, LANES)), np.empty((4, 0)), 0, 0
+)
+
+
+class AvatarTree(NamedTuple):
+    """Tree of points on their own lattice: world = low + steps * step.
+
+    steps: (n, 3) float64, whole numbers, in the order of the leaf nodes.  order: (n,), their rows.
+    levels: from the root to the leaf nodes, the first point of each node of a level, and n.
+    """
+
+    steps: _Floats
+    order: _Integers
+    levels: list[_Integers]
+    low: _Floats
+    step: float
 
 
 class AvatarModel(NamedTuple):
@@ -93,17 +112,26 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
         )
     if radius is not None and not (np.isfinite(radius) and radius >= 0):
         raise BadRequestError(f"avatar radius {radius!r}: expected zero or a positive length in metres")
-    if not len(array):
-        nodes, blocks = np.empty(0, np.int32), np.empty((0, 3, LANES))
-        empty = Avatar(np.empty((0, 3)), np.empty(0), nodes, nodes, blocks, np.empty((4, 0)), 0, 0)
-        return _model(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0, 0)
-    tree = pack_points(array)
-    if radius is None:
-        radius = mean_spacing(tree) / 2
-        if radius == 0.0:
-            raise BadRequestError(
-                "avatar of a single distinct point has no closest-point distance: give a radius"
-            )
+    rows = np.empty((0, LANES), np.int32)
+    arrays, bounding_radius, box = _EMPTY, 0.0, np.zeros((2, 3))
+    if len(array):
+        tree = pack_points(array)
+        if radius is None:
+            radius = mean_spacing(tree) / 2
+            if radius == 0.0:
+                raise BadRequestError(
+                    "avatar of a single distinct point has no closest-point distance: give a radius"
+                )
+        arrays, rows = _lay_out(tree, array, inner_points)
+        bounding_radius = float(arrays.radius[0]) + float(radius)
+        box = np.array([array.min(axis=0), array.max(axis=0)])
+    radius = float(radius or 0.0)
+    reference = refer_to_avatar(arrays, rows, len(array) - inner_points, array, radius, box)
+    return AvatarModel(array, radius, arrays, rows, bounding_radius, box, reference, inner_points)
+
+
+def _lay_out(tree: AvatarTree, points: _Floats, inner_points: int) -> tuple[Avatar, NDArray[np.int32]]:
+    """Return the arrays of a tree, and the row of `points` (n, 3) in each lane of a block."""
     center, node_radius = bound_nodes(tree)
     # Rounding moves a point by less than sqrt(3) lattice steps. Two more steps in the radius
     # therefore enclose the given points, including the rounding of these sums.
@@ -125,43 +153,13 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
         node_radius,
         np.concatenate([*first, ~np.arange(sizes[-1])]).astype(np.int32),
         np.concatenate(counts).astype(np.int32),
-        np.ascontiguousarray(array[rows].transpose(0, 2, 1)),
+        np.ascontiguousarray(points[rows].transpose(0, 2, 1)),
         # `concatenate` may return another memory order, and numba would recompile every kernel.
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
         inner_points,
     )
-    bounding_radius = float(node_radius[0]) + float(radius)
-    return _model(array, float(radius), arrays, rows, bounding_radius, inner_points)
-
-
-def _model(
-    points: NDArray[np.float64],
-    radius: float,
-    arrays: Avatar,
-    rows: NDArray[np.int32],
-    bounding_radius: float,
-    inner_points: int,
-) -> AvatarModel:
-    """Return the model with these fields."""
-    points = np.ascontiguousarray(points)
-    box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.zeros((2, 3))
-    reference = refer_to_avatar(arrays, rows, len(points) - inner_points, points, radius, box)
-    return AvatarModel(points, radius, arrays, rows, bounding_radius, box, reference, inner_points)
-
-
-class AvatarTree(NamedTuple):
-    """Tree of points on their own lattice: world = low + steps * step.
-
-    steps: (n, 3) float64, whole numbers, in the order of the leaf nodes.  order: (n,), their rows.
-    levels: from the root to the leaf nodes, the first point of each node of a level, and n.
-    """
-
-    steps: _Floats
-    order: _Integers
-    levels: list[_Integers]
-    low: _Floats
-    step: float
+    return arrays, rows
 
 
 def pack_points(points: _Floats) -> AvatarTree:

@@ -4,15 +4,14 @@ import threading
 import time
 from collections.abc import Collection
 from contextlib import nullcontext
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from msgspec import structs
 
 from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ...schemas.wire.encoding import avatar_digest
 from ...schemas.wire.key_expressions import check_name
-from ...schemas.wire.requests import check_avatar_name
+from ...schemas.wire.requests import AddAvatarRequest, check_avatar_name
 from ...schemas.wire.stats import AvatarStats
 from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar
@@ -36,17 +35,6 @@ class _Entry:
 
     def __init__(self, model: AvatarModel, asked: float | None, size: int) -> None:
         self.model, self.asked, self.bytes, self.used = model, asked, size, time.monotonic()
-
-
-class _Totals(NamedTuple):
-    """Totals over the avatars of all clients.
-
-    bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
-    """
-
-    bytes: int
-    avatars: int
-    clients: int
 
 
 def check_owner(client: str) -> None:
@@ -97,33 +85,25 @@ class Avatars:
         with self._lock:
             self._clients.setdefault(EVERYBODY, {})[name] = _Entry(model, model.radius, bytes_of(model))
 
-    def add(
-        self,
-        name: str,
-        points: NDArray[np.float64],
-        radius: float | None,
-        client: str,
-        inner_points: int = 0,
-    ) -> AvatarModel:
-        """Build an avatar of points and store it, unless the same one exists already.
+    def add(self, request: AddAvatarRequest, client: str) -> AvatarModel:
+        """Build an avatar and store it, unless the same one exists already.
 
-        points: (n, 3) float64, checked [m].  radius, inner_points: as for `make_avatar`.
         An avatar with the name of a scene avatar must equal it, and shares its arrays. Of two requests
         that add the same avatar at a time, both build it and one is stored. Raise BadRequestError if a
         name is invalid or belongs to a different avatar, TooLargeError beyond the limits.
         """
-        check_avatar_name(name)
         check_owner(client)
+        name, count = request.name, len(request.points)
         with self._lock:
             entry = self._clients.get(client, {}).get(name)
             shared = self._clients.get(EVERYBODY, {}).get(name)
         if entry is None:
             if shared is None:
-                self._check_room(name, client, len(points), _LEAST_BYTES + _BYTES_A_POINT * len(points))
-                model = self._build(points, radius, inner_points)
+                self._check_room(name, client, count, _LEAST_BYTES + _BYTES_A_POINT * count)
+                model = self._build(request, request.radius)
                 size = bytes_of(model)
             else:
-                self._check_same(name, shared, points, radius, inner_points)
+                self._check_same(shared, request)
                 model, size = shared.model, _LEAST_BYTES
             if client != EVERYBODY:
                 digest = avatar_digest(model.points, model.radius, model.inner_points)
@@ -131,32 +111,25 @@ class Avatars:
             with self._lock:
                 entry = self._clients.get(client, {}).get(name)
                 if entry is None:
-                    self._check_room(name, client, len(points), size)
-                    entry = self._clients.setdefault(client, {})[name] = _Entry(model, radius, size)
-        self._check_same(name, entry, points, radius, inner_points)
+                    self._check_room(name, client, count, size)
+                    entry = self._clients.setdefault(client, {})[name] = _Entry(model, request.radius, size)
+        self._check_same(entry, request)
         return entry.model
 
-    def _build(self, points: NDArray[np.float64], radius: float | None, inner_points: int = 0) -> AvatarModel:
-        with self._large if len(points) > _LARGE else nullcontext():
-            return make_avatar(points, radius, inner_points)
+    def _build(self, request: AddAvatarRequest, radius: float | None) -> AvatarModel:
+        with self._large if len(request.points) > _LARGE else nullcontext():
+            return make_avatar(request.points, radius, request.inner_points)
 
-    def _check_same(
-        self,
-        name: str,
-        entry: _Entry,
-        points: NDArray[np.float64],
-        radius: float | None,
-        inner_points: int,
-    ) -> None:
+    def _check_same(self, entry: _Entry, request: AddAvatarRequest) -> None:
         """Raise BadRequestError unless a known avatar has this content."""
-        known = entry.model
-        same = known.inner_points == inner_points and np.array_equal(known.points, points)
+        known, radius = entry.model, request.radius
+        same = known.inner_points == request.inner_points and np.array_equal(known.points, request.points)
         if same and radius is None and entry.asked is not None:
             # One radius is given and one is the default of the points, which only building yields.
-            radius = self._build(points, None).radius
+            radius = self._build(request, None).radius
         if not same or (radius is not None and radius != known.radius):
             raise BadRequestError(
-                f"avatar {name!r} exists with other points or another radius: use another name"
+                f"avatar {request.name!r} exists with other points or another radius: use another name"
             )
 
     def names(self) -> list[str]:
@@ -187,9 +160,9 @@ class Avatars:
         """Return the memory and number of all clients' avatars, and the limits."""
         limits, totals = self.limits, self._totals()
         if limits is None:
-            return AvatarStats(*totals)
-        return AvatarStats(
-            *totals,
+            return totals
+        return structs.replace(
+            totals,
             max_bytes=limits.bytes,
             max_bytes_by_client=limits.bytes_by_client,
             max_avatars=limits.avatars,
@@ -197,11 +170,12 @@ class Avatars:
             max_clients=limits.clients,
         )
 
-    def _totals(self) -> _Totals:
+    def _totals(self) -> AvatarStats:
+        """Return the bytes and numbers of all clients' avatars, without the limits."""
         with self._lock:
             own = [entries for client, entries in self._clients.items() if client not in _OWN]
             each = [entry.bytes for entries in own for entry in entries.values()]
-        return _Totals(sum(each), len(each), len(own))
+        return AvatarStats(sum(each), len(each), len(own))
 
     def _check_room(self, name: str, client: str, count: int, size: int) -> None:
         """Raise TooLargeError if an avatar of `count` points and `size` bytes more exceeds the limits."""

@@ -16,7 +16,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Self
+from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -175,11 +176,6 @@ class UserTracks:
         self._lock = threading.Lock()
         self._users: dict[User, _Track] = {}
 
-    @property
-    def users(self) -> list[User]:
-        """Return the known users, in order of arrival."""
-        return list(self._users)
-
     def record_pose(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
         """Record a pose and return whether it is a teleport, which discards the poses before it.
 
@@ -274,7 +270,7 @@ def _is_needed_later(need: dict[int, float], than: float) -> Callable[[int], boo
 
 
 class Prefetcher:
-    """Prefetch thread of one residency. A context manager. Thread-safe.
+    """Prefetch thread of one residency. Thread-safe.
 
     The thread starts when the first user is seen.
     """
@@ -286,7 +282,6 @@ class Prefetcher:
         *,
         prefetch: bool = True,
         idle: Iterator[object] | None = None,
-        clock: Callable[[], float] = time.perf_counter,
         level: VoxelCache | None = None,
     ) -> None:
         """Make a prefetcher without a thread.
@@ -294,10 +289,9 @@ class Prefetcher:
         prefetch: whether to prefetch; if False, load only owed voxels and keep users' voxels.
         idle: advanced when there is nothing to load, until its end; each step does some
         milliseconds of work.
-        clock: returns the time [s].
         level: cache of the level of detail, whose owed loads are done before those of `residency`.
         """
-        self._residency, self._tracks, self._clock, self._prefetch = residency, tracks, clock, prefetch
+        self._residency, self._tracks, self._prefetch = residency, tracks, prefetch
         self._work = threading.Event()
         self._urgent = threading.Event()  # ends a rest
         self._lock = threading.Lock()  # guards starting and stopping
@@ -309,16 +303,8 @@ class Prefetcher:
         for cache in self._caches:
             cache.on_owed = self._owed
 
-    def __enter__(self) -> Self:
-        """Return the prefetcher itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop; a load that has begun is finished."""
-        self.stop()
-
     def stop(self) -> None:
-        """Stop loading, and wait for the thread."""
+        """Stop loading, and wait for the thread; a load that has begun is finished."""
         with self._lock:
             self._stopped, thread = True, self._thread
         for cache in self._caches:
@@ -334,7 +320,7 @@ class Prefetcher:
 
         Return whether it teleported there.
         """
-        jumped = self._tracks.record_pose(user, self._clock(), center, reach)
+        jumped = self._tracks.record_pose(user, time.perf_counter(), center, reach)
         self._seen = True
         self._wake()
         return jumped
@@ -373,7 +359,7 @@ class Prefetcher:
         need: dict[int, float] = {}
         due = -math.inf
         while True:
-            now = self._clock()
+            now = time.perf_counter()
             if self._seen and now >= due:
                 self._seen = False
                 need, due = self._planned(now)
@@ -440,30 +426,27 @@ class Prefetcher:
                     return True
             while queue:
                 row, at = queue.popleft()
-                if residency.is_resident(row) or self._clock() < self._failed.get(row, -math.inf) + SILENCE:
+                if (
+                    residency.is_resident(row)
+                    or time.perf_counter() < self._failed.get(row, -math.inf) + SILENCE
+                ):
                     continue
                 found = residency.load_in_background(row, _is_needed_later(need, at))
                 if found is BackgroundLoad.NO_ROOM:
                     queue.clear()  # voxels needed later would find no room either
                 elif found is BackgroundLoad.FAILED:
-                    self._failed[row] = self._clock()
+                    self._failed[row] = time.perf_counter()
                 return True
         except Exception:  # for example out of memory: a request for the voxel reports it
             log.exception("a prefetch failed")
             if row >= 0:
-                self._failed[row] = self._clock()
+                self._failed[row] = time.perf_counter()
             return True
         return False
 
     def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:
         """Select rows, soonest needed first, that fit together in KEPT_SHARE of the budget."""
-        left = int(KEPT_SHARE * self._residency.budget_bytes)
-        if self._residency.bytes_of(rows) <= left:
-            return frozenset(rows)
-        kept = []
-        for row in sorted(rows, key=lambda row: need.get(row, math.inf)):
-            left -= self._residency.bytes_of([row])
-            if left < 0:
-                break
-            kept.append(row)
-        return frozenset(kept)
+        rows = sorted(rows, key=lambda row: need.get(row, math.inf))
+        taken = accumulate(self._residency.bytes_of([row]) for row in rows)
+        share = KEPT_SHARE * self._residency.budget_bytes
+        return frozenset(row for row, size in zip(rows, taken, strict=True) if size <= share)

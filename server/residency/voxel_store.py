@@ -67,16 +67,7 @@ class VoxelStore:
         Return the offsets of its runs (3,) int64, see scene_arrays.py. Raise CorruptError or
         OSError.
         """
-        return self.decode(row, self.archive.read_frames(row), arena, offset)
-
-    def decode(
-        self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
-    ) -> NDArray[np.int64]:
-        """Lay out a voxel like `load`, from frames already read with `Archive.read_frames`.
-
-        Return the offsets of its runs (3,) int64. Raise CorruptError.
-        """
-        record = self.archive.open_voxel(row, frames)
+        record = self.archive.open_voxel(row)
         leaves = record.leaves
         where = np.empty(3, np.int64)
         shift = np.int64(top_shift(record.voxel_steps))

@@ -5,6 +5,7 @@ import threading
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
+from solidcloud.schemas.wire.requests import AddAvatarRequest
 from solidcloud.server.avatars import client_avatars as avatars_module
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.client_avatars import Avatars, bytes_of
@@ -12,6 +13,10 @@ from solidcloud.server.scene_interface import EVERYBODY, AvatarLimits
 
 LIMITS = AvatarLimits(bytes=100_000, bytes_by_client=60_000, avatars=10, avatars_by_client=4, clients=3)
 BODY = np.random.default_rng(5).uniform(-1, 1, (500, 3))  # some 29 kB
+
+
+def add(avatars, name, points, radius, client):
+    return avatars.add(AddAvatarRequest(name, points, radius), client)
 
 
 @pytest.mark.parametrize("count", [0, 1, 33, 1000])
@@ -28,8 +33,8 @@ def test_what_is_reserved_is_enough(count, kind):
 
 def test_bytes_and_numbers_are_counted_and_told():
     avatars = Avatars(LIMITS)
-    model = avatars.add("al", BODY, 0.01, "a")
-    avatars.add("own", BODY, 0.01, EVERYBODY)
+    model = add(avatars, "al", BODY, 0.01, "a")
+    add(avatars, "own", BODY, 0.01, EVERYBODY)
     stats = avatars.stats()
     assert (stats.bytes, stats.avatars, stats.clients) == (bytes_of(model), 1, 1)
     assert (stats.max_bytes, stats.max_bytes_by_client, stats.max_avatars) == (100_000, 60_000, 10)
@@ -40,22 +45,22 @@ def test_bytes_and_numbers_are_counted_and_told():
 
 def test_a_clients_bytes_are_limited():
     avatars = Avatars(LIMITS)
-    held = 2 * bytes_of(avatars.add("1", BODY, 0.01, "a"))
-    avatars.add("2", BODY, 0.01, "a")
+    held = 2 * bytes_of(add(avatars, "1", BODY, 0.01, "a"))
+    add(avatars, "2", BODY, 0.01, "a")
     with pytest.raises(
         TooLargeError, match=rf"'3' of 500 points: {held} bytes of this client.*at most 60000"
     ):
-        avatars.add("3", BODY, 0.01, "a")
-    avatars.add("1", BODY, 0.01, "b")
+        add(avatars, "3", BODY, 0.01, "a")
+    add(avatars, "1", BODY, 0.01, "b")
 
 
 def test_all_clients_bytes_are_limited():
     avatars = Avatars(LIMITS)
     for client, name in (("a", "1"), ("a", "2"), ("b", "1")):
-        avatars.add(name, BODY, 0.01, client)
+        add(avatars, name, BODY, 0.01, client)
     with pytest.raises(TooLargeError, match="bytes of all clients' avatars"):
-        avatars.add("2", BODY, 0.01, "b")
-    avatars.add("own", BODY, 0.01, EVERYBODY)
+        add(avatars, "2", BODY, 0.01, "b")
+    add(avatars, "own", BODY, 0.01, EVERYBODY)
 
 
 @pytest.mark.parametrize(
@@ -68,42 +73,42 @@ def test_all_clients_bytes_are_limited():
 def test_a_clients_avatars_are_limited(limits, what):
     avatars = Avatars(limits)
     for number in range(4):
-        avatars.add(str(number), BODY[:2], 0.01, "a")
+        add(avatars, str(number), BODY[:2], 0.01, "a")
     with pytest.raises(TooLargeError, match=what):
-        avatars.add("4", BODY[:2], 0.01, "a")
-    avatars.add("3", BODY[:2], 0.01, "a")
+        add(avatars, "4", BODY[:2], 0.01, "a")
+    add(avatars, "3", BODY[:2], 0.01, "a")
 
 
 def test_the_number_of_clients_is_limited():
     avatars = Avatars(LIMITS)
     for client in "abc":
-        avatars.add("al", BODY[:2], 0.01, client)
+        add(avatars, "al", BODY[:2], 0.01, client)
     with pytest.raises(TooLargeError, match="3 clients with avatars exist"):
-        avatars.add("al", BODY[:2], 0.01, "d")
-    avatars.add("bo", BODY[:2], 0.01, "c")
+        add(avatars, "al", BODY[:2], 0.01, "d")
+    add(avatars, "bo", BODY[:2], 0.01, "c")
     avatars.drop_client("a")
-    avatars.add("al", BODY[:2], 0.01, "d")
+    add(avatars, "al", BODY[:2], 0.01, "d")
 
 
 def test_what_was_refused_or_failed_is_not_counted():
     avatars = Avatars(LIMITS)
     with pytest.raises(TooLargeError):
-        avatars.add("al", np.zeros((5000, 3)), 0.01, "a")
+        add(avatars, "al", np.zeros((5000, 3)), 0.01, "a")
     with pytest.raises(BadRequestError):
-        avatars.add("al", np.zeros((5, 3)), None, "a")
+        add(avatars, "al", np.zeros((5, 3)), None, "a")
     assert avatars.stats().avatars == avatars.stats().bytes == avatars.stats().clients == 0
 
 
 def test_the_same_avatar_again_is_the_same_and_another_is_refused():
     avatars = Avatars(LIMITS)
-    first = avatars.add("al", BODY, None, "a")
-    assert avatars.add("al", BODY.copy(), None, "a") is first
-    assert avatars.add("al", BODY, first.radius, "a") is first
-    second = avatars.add("bo", BODY[:50], make_avatar(BODY[:50]).radius, "a")
-    assert avatars.add("bo", BODY[:50], None, "a") is second
+    first = add(avatars, "al", BODY, None, "a")
+    assert add(avatars, "al", BODY.copy(), None, "a") is first
+    assert add(avatars, "al", BODY, first.radius, "a") is first
+    second = add(avatars, "bo", BODY[:50], make_avatar(BODY[:50]).radius, "a")
+    assert add(avatars, "bo", BODY[:50], None, "a") is second
     for points, radius in ((BODY + 1, None), (BODY, 0.5), (BODY[:9], None)):
         with pytest.raises(BadRequestError, match="other points or another radius"):
-            avatars.add("al", points, radius, "a")
+            add(avatars, "al", points, radius, "a")
     assert avatars.stats().avatars == 2
 
 
@@ -117,13 +122,13 @@ def test_of_two_that_are_built_at_a_time_one_is_stored_within_the_limits(monkeyp
     monkeypatch.setattr(avatars_module, "make_avatar", slowly)
     made, refused = [], []
 
-    def add(name):
+    def build(name):
         try:
-            made.append(avatars.add(name, BODY, 0.01, "a"))
+            made.append(add(avatars, name, BODY, 0.01, "a"))
         except TooLargeError as error:
             refused.append(str(error))
 
-    threads = [threading.Thread(target=add, args=(name,)) for name in ("al", "al", "bo")]
+    threads = [threading.Thread(target=build, args=(name,)) for name in ("al", "al", "bo")]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -137,7 +142,7 @@ def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):
     monkeypatch.setattr(avatars_module.time, "monotonic", lambda: now[0])
     avatars = Avatars(LIMITS)
     for client, name in (("gone", "al"), ("gone", "bo"), ("here", "al"), (EVERYBODY, "own"), ("", "ours")):
-        avatars.add(name, BODY[:2], 0.01, client)
+        add(avatars, name, BODY[:2], 0.01, client)
     now[0] += 59
     avatars.get("bo", "gone")
     now[0] += 2

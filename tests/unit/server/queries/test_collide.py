@@ -13,6 +13,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, TooLargeError
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -112,9 +113,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     case = archive_cases.build(tmp_path_factory.mktemp("scene"), synthetic_scans.make_scan("plane", 1, 100))
     opened = Scene.open(case.archive)
     opened.add_avatar("ball", [[0.0, 0, 0]], 0.1)
-    opened._avatars.add(
-        "nobody", np.empty((0, 3)), None, ""
-    )  # the engine answers it, `add_avatar` refuses it
+    # The engine answers an avatar without points, `add_avatar` refuses it.
+    opened._avatars.provide("nobody", make_avatar(np.empty((0, 3))))
     return opened
 
 
@@ -187,7 +187,7 @@ def test_a_tolerance_makes_contact_early_by_no_more_and_gives_bounds(tmp_path: P
     poses = np.array([archive_cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
-        scene._avatars.add("nothing", np.zeros((0, 3)), 0.25, "")
+        scene._avatars.provide("nothing", make_avatar(np.zeros((0, 3)), 0.25))
         for asked in (poses, *poses[:, None]):
             exact = scene.collide("ball", asked, 0.125)
             answers = scene.collide("ball", asked, 0.125, tolerance=0.5)

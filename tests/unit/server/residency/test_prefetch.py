@@ -66,6 +66,11 @@ class Table:
         self.wishes = Wishes()
         self.prefetcher = Prefetcher(self.residency, self.wishes, **options)  # type: ignore[arg-type]
 
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *_: object) -> None:
+        self.prefetcher.stop()
+
     def see(self) -> None:
         """A user moves."""
         self.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1.0)
@@ -86,7 +91,7 @@ def until(condition: Callable[[], bool]) -> bool:
 def test_what_is_wanted_is_loaded_soonest_first_and_counted() -> None:
     table = Table([1] * 5, 5)
     table.wishes.wanted = {3: 0.5, 1: 0.1, 4: 2.0}
-    with table.prefetcher:
+    with table:
         table.see()
         assert until(lambda: table.resident() == [1, 3, 4])
         assert list(table.store.loads) == [1, 3, 4], "in this order"
@@ -102,7 +107,7 @@ def test_what_users_stand_in_or_need_sooner_does_not_go() -> None:
     table = Table([1] * 6, 3)
     table.wishes.wanted = {0: 0.0, 1: 0.2, 2: 0.4, 3: 0.6, 4: 0.8}
     table.wishes.standing = [0]
-    with table.prefetcher:
+    with table:
         table.see()
         assert until(lambda: table.resident() == [0, 1, 2])
         plans = table.wishes.plans
@@ -122,7 +127,7 @@ def test_nothing_is_begun_while_a_request_waits() -> None:
     table = Table([1] * 3, 3)
     table.store.gate.clear()
     table.wishes.wanted = {1: 0.1}
-    with table.prefetcher:
+    with table:
         from concurrent.futures import ThreadPoolExecutor
 
         with ThreadPoolExecutor(1) as pool:
@@ -139,7 +144,7 @@ def test_nothing_is_begun_while_a_request_waits() -> None:
 
 def test_what_came_too_late_for_a_request_is_loaded_after_it() -> None:
     table = Table([1] * 3, 2, prefetch=False)
-    with table.prefetcher:
+    with table:
         with table.residency.hold([0, 2], deadline=0.0) as held:
             assert held.late == (0, 2)
         assert until(lambda: table.resident() == [0, 2])
@@ -153,7 +158,7 @@ def test_a_load_that_fails_leaves_nothing_and_the_next_goes_on(fault: str) -> No
     table = Table([1] * 3, 3)
     table.store.faults[0] = fault
     table.wishes.wanted = {0: 0.1, 1: 0.2}
-    with table.prefetcher:
+    with table:
         table.see()
         assert until(lambda: table.store.loads[0] > 0)
         table.see()
@@ -170,7 +175,7 @@ def test_a_load_that_fails_leaves_nothing_and_the_next_goes_on(fault: str) -> No
 def test_a_client_that_goes_keeps_nothing() -> None:
     table = Table([1] * 3, 3)
     table.wishes.wanted, table.wishes.standing = {0: 0.0}, [0]
-    with table.prefetcher:
+    with table:
         table.see()
         assert until(lambda: table.residency.kept == {0} and table.resident() == [0])
         table.prefetcher.leave_client("client")
@@ -181,7 +186,7 @@ def test_a_client_that_goes_keeps_nothing() -> None:
 def test_who_comes_from_nowhere_is_told_so_and_idle_time_is_used() -> None:
     calls: list[int] = []
     table = Table([1] * 3, 3, idle=(calls.append(step) for step in range(3)))
-    with table.prefetcher:
+    with table:
         assert table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1e3)
         assert not table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1.0)
         assert until(lambda: len(calls) == 3)
@@ -386,13 +391,15 @@ def test_who_leaves_is_forgotten() -> None:
     other = ("other", "me")
     for user in (ME, YOU, other):
         walk(around, straight(1.0), user=user)
-    assert around.users == [ME, YOU, other]
+    assert list(around._users) == [ME, YOU, other]
     around.leave_client("client")
-    assert around.users == [other] and len(plan(around, 1.0, 0.1).rows)
+    assert list(around._users) == [other] and len(plan(around, 1.0, 0.1).rows)
     around.expire(29 / 30 + 10.0, 10.0)
-    assert around.users == [other]
+    assert list(around._users) == [other]
     around.expire(11.0, 10.0)
-    assert around.users == [] and len(plan(around, 11.0, 0.1).rows) == 0 and around.kept().tolist() == []
+    assert (
+        list(around._users) == [] and len(plan(around, 11.0, 0.1).rows) == 0 and around.kept().tolist() == []
+    )
 
 
 # --- against brute force over all voxels at many moments of the way ---------------------------

@@ -31,7 +31,7 @@ from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.reach import all_resident
 from ..core.voxels_in_reach import VALID
 from ..motion.sweep_resident import MAX_UNDECIDED, longest_way, pose_between, sweep_resident
-from ..motion.vectors import (
+from ..motion.vector_tuples import (
     copy_pose,
     divided,
     dot,

@@ -24,7 +24,7 @@ from ..core.node_bounds import STACK, U32
 from ..core.placed_avatar import MAX_REACH_UNITS, Avatar, largest_term, place, to_units
 from ..core.scene_arrays import LANES, stopped
 from ..motion.screw_motion import make_motion
-from ..motion.vectors import Vector, dot, minus, place_of, placed, point_of, vector
+from ..motion.vector_tuples import Vector, dot, minus, place_of, placed, point_of, vector
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
 # A rotation may shear by RIGID_TOLERANCE, 1e-9, and stretch a radius by as much.

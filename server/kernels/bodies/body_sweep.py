@@ -33,7 +33,7 @@ from ..motion.moving_avatar import least_square
 from ..motion.screw_motion import ScrewMotion, make_motion, pose_at
 from ..motion.sweep_interval import LEAST_SAGITTA, pair_times
 from ..motion.sweep_segments import CHORD_BEND, MAX_REFUSED, longest_part
-from ..motion.vectors import dot, minus, place_of, placed, plus, point_of, put, times, vector
+from ..motion.vector_tuples import dot, minus, place_of, placed, plus, point_of, put, times, vector
 from .body_pairs import STRETCH, PlacedBody
 
 
@@ -48,7 +48,7 @@ class BodyScratch(NamedTuple):
     stamps: (2, blocks) int64: the chord and the body that a block was placed for.
     turns: (2,) int64, chords and bodies so far.
     keep: (LANES,).
-    ends: (2, 4, 4), shifts: (2, 3): the poses of a chord's ends and their translations.
+    ends: (2, 4, 4), the poses of a chord's ends.
     first: (2,), when the first contact is possible, and when a contact is certain.
     pair: (4,) int64, block and lane of either point.
     counters: (2,), node visits, point tests.
@@ -63,7 +63,6 @@ class BodyScratch(NamedTuple):
     turns: NDArray[np.int64]
     keep: NDArray[np.bool_]
     ends: NDArray[np.float64]
-    shifts: NDArray[np.float64]
     first: NDArray[np.float64]
     pair: NDArray[np.int64]
     counters: NDArray[np.int64]
@@ -77,8 +76,7 @@ def make_body_scratch(nodes: int, blocks: int) -> BodyScratch:
     return BodyScratch(
         np.empty((STACK, 2), np.int64), np.empty((8, nodes)), np.empty((blocks, 7, LANES)), np.empty((4, nodes)),
         np.empty((blocks, 3, LANES)), np.full((2, blocks), -1, np.int64), np.zeros(2, np.int64),
-        np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty((2, 3)), np.empty(2),
-        np.zeros(4, np.int64), np.zeros(2, np.int64),
+        np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty(2), np.zeros(4, np.int64), np.zeros(2, np.int64),
     )  # fmt: skip
 
 
@@ -124,14 +122,19 @@ def _inverse_square(x, y, z):
 @njit_no_refcount
 def _place_moving(sweep, block):
     """Place the points of a leaf node of the moving avatar at both ends of a chord."""
-    paths, ends, shifts = sweep.scratch.paths, sweep.scratch.ends, sweep.scratch.shifts
-    points = sweep.a.points
+    paths, points, first, last = (
+        sweep.scratch.paths,
+        sweep.a.points,
+        sweep.scratch.ends[0],
+        sweep.scratch.ends[1],
+    )
+    shift_first, shift_last = place_of(first), place_of(last)
     for r in range(3):
         for k in range(LANES):
             x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
-            begin = place(ends[0], shifts[0], r, x, y, z)
+            begin = place(first, shift_first, r, x, y, z)
             paths[block, r, k] = begin
-            paths[block, 3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
+            paths[block, 3 + r, k] = place(last, shift_last, r, x, y, z) - begin
     for k in range(LANES):
         paths[block, 6, k] = _inverse_square(paths[block, 3, k], paths[block, 4, k], paths[block, 5, k])
 
@@ -149,11 +152,11 @@ def _place_standing(sweep, block):
 @njit_no_refcount
 def _place_moving_nodes(sweep, count):
     """Place the first `count` nodes of the moving avatar at both ends of a chord."""
-    moving, ends, shifts = sweep.scratch.moving, sweep.scratch.ends, sweep.scratch.shifts
+    moving, first, last = sweep.scratch.moving, sweep.scratch.ends[0], sweep.scratch.ends[1]
     for i in range(count):
         center = vector(sweep.a.center[i])
-        begin = placed(ends[0], shifts[0], center)
-        way = minus(placed(ends[1], shifts[1], center), begin)
+        begin = placed(first, place_of(first), center)
+        way = minus(placed(last, place_of(last), center), begin)
         for r in range(3):
             moving[r, i], moving[3 + r, i] = begin[r], way[r]
         moving[6, i] = _inverse_square(way[0], way[1], way[2])
@@ -181,9 +184,9 @@ def _latest(scratch):
 def _try_pair(sweep, chord, block_a, lane_a, block_b, lane_b):
     """Update scratch.first with one pair of points; lanes are those of block_b."""
     scratch, first = sweep.scratch, sweep.scratch.first
-    ends, shifts, point = scratch.ends, scratch.shifts, point_of(sweep.a.points, block_a, lane_a)
-    begin = times(UNITS_PER_METRE, placed(ends[0], shifts[0], point))
-    end = times(UNITS_PER_METRE, placed(ends[1], shifts[1], point))
+    ends, point = scratch.ends, point_of(sweep.a.points, block_a, lane_a)
+    begin = times(UNITS_PER_METRE, placed(ends[0], place_of(ends[0]), point))
+    end = times(UNITS_PER_METRE, placed(ends[1], place_of(ends[1]), point))
     x, y, z = times(UNITS_PER_METRE, point_of(scratch.lanes, block_b, lane_b))
     standing = np.rint(x), np.rint(y), np.rint(z)
     gap, displacement = minus(begin, standing), minus(end, begin)
@@ -351,11 +354,8 @@ def _search(sweep, t0, t1):
     Returns whether halving the interval is useless.
     """
     motion, scratch = sweep.motion, sweep.scratch
-    ends, shifts = scratch.ends, scratch.shifts
-    pose_at(motion, t0, ends[0])
-    pose_at(motion, t1, ends[1])
-    put(shifts[0], place_of(ends[0]))
-    put(shifts[1], place_of(ends[1]))
+    pose_at(motion, t0, scratch.ends[0])
+    pose_at(motion, t1, scratch.ends[1])
     sagitta = motion.bend * (t1 - t0) * (t1 - t0) / 8.0 * UNITS_PER_METRE
     # The standing point is an integer, except far out where float64 cannot represent it; `error`
     # covers that.

@@ -18,7 +18,7 @@ from ..core.node_bounds import STACK
 from ..core.normal_codes import NO_NORMAL, SUMS, add_sums, decode_normal, normal_code
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class
 from ..motion.sweep_interval import scan_point
-from ..motion.vectors import (
+from ..motion.vector_tuples import (
     divided,
     dot,
     minus,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from .vectors import Vector, column, cross, divided, dot, minus, norm, place_of, plus, rotate, times
+from .vector_tuples import Vector, column, cross, divided, dot, minus, norm, place_of, plus, rotate, times
 
 # Coefficients of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2, the omitted
 # terms are below 2^-58.

@@ -63,7 +63,7 @@ from ..core.scene_arrays import (
 )
 from .moving_avatar import AvatarChord, least_square, place_block, place_nodes
 from .screw_motion import pose_at
-from .vectors import dot, minus, norm, place_of, placed, plus, point_of, put, times
+from .vector_tuples import dot, minus, norm, place_of, placed, plus, point_of, put, times
 
 # Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
 # 0.87 to the band.

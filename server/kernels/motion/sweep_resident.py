@@ -27,7 +27,7 @@ from .sweep_segments import (
     make_plan_space,
     plan_segments,
 )
-from .vectors import column, copy_pose, dot, minus, norm, place_of, plus, put, times, vector
+from .vector_tuples import column, copy_pose, dot, minus, norm, place_of, plus, put, times, vector
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 

@@ -17,7 +17,7 @@ from ..core.scene_arrays import stopped
 from .moving_avatar import AvatarSweep
 from .screw_motion import make_motion, pose_at
 from .sweep_interval import found_pair, pair_point, search, touches_at
-from .vectors import divided, minus, norm, place_of, placed, plus, point_of, put, times, vector
+from .vector_tuples import divided, minus, norm, place_of, placed, plus, point_of, put, times, vector
 
 # Extent of a segment, and thereby of what must be resident together: four avatars plus 8 m.
 _SEGMENT_SIZES, _SEGMENT_MORE = 4.0, 8.0

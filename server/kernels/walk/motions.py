@@ -14,7 +14,7 @@ from ....schemas.runtime import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.normal_codes import MAX_NORMAL_REACH
 from ..motion.sweep_resident import MIN_MOTION, skin_fraction
-from ..motion.vectors import (
+from ..motion.vector_tuples import (
     copy_pose,
     cross,
     divided,

@@ -30,7 +30,7 @@ from ..collide.collide_poses import collide_resident
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.reach import VALID, all_resident
 from ..motion.sweep_resident import MAX_UNDECIDED, longest_way, pose_between, sweep_resident
-from ..motion.vectors import (
+from ..motion.vector_tuples import (
     copy_pose,
     divided,
     dot,

@@ -18,7 +18,7 @@ from ....schemas.runtime import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.array_references import AvatarReference, SceneReference, record_type, reference
 from ..motion.sweep_resident import SWEPT, MotionScratch
-from ..motion.vectors import place_of
+from ..motion.vector_tuples import place_of
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 

@@ -11,7 +11,7 @@ import numpy as np
 from ....schemas.runtime import compiling as nb
 from ..bodies.leave_contact import find_heights
 from ..motion.sweep_resident import MIN_MOTION
-from ..motion.vectors import (
+from ..motion.vector_tuples import (
     Vector,
     copy_pose,
     divided,

@@ -123,6 +123,7 @@ def _without_collector() -> Iterator[None]:
 # sent to all functions in work. Nobody reads it.
 llvm.ffi.lib._lock._cblist.clear()
 
+
 class _Pipeline(compiler.CompilerBase):  # type: ignore[misc]
     """numba's passes but for those of closures and of array expressions, which no kernel has."""
 

@@ -17,15 +17,18 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values`, which is replaced by a faster one, and the callbacks of llvmlite's lock, which are
-  removed; the options of functions of numba's own library (`jit_registry`);
+- `Flags.values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
+  and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of
+  numba's own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
 
+import contextlib
 import functools
+import gc
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import llvmlite.binding as llvm
@@ -38,8 +41,11 @@ from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.core.target_extension import cpu_target, jit_registry
+from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NopythonRewrites
 from numba.core.types import unliteral
+from numba.core.types.abstract import _TypeMetaclass
+from numba.core.types.functions import BaseFunction
 from numba.core.untyped_passes import InlineClosureLikes
 
 # numba creates their attributes on import, invisible to type checkers.
@@ -71,13 +77,51 @@ def _values(self: Any) -> dict[str, Any]:
 compiler.Flags.values = _values
 
 
+# Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
+# the same as what Python code of `abc` finds.
+_TypeMetaclass.__instancecheck__ = type.__instancecheck__
+_search_call_type = BaseFunction.get_call_type
+
+
+def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """Return the signature of a call of a function of numba's own library.
+
+    numba tries all implementations for each call. Four of five calls are of a function and of types that
+    were met before, with the same counting of references, for which an implementation is compiled.
+    """
+    flags = ConfigStack.top_or_none()
+    if kws or flags is None:
+        return _search_call_type(self, context, args, kws)
+    found = self.__dict__.setdefault("_found_calls", {})
+    case = context, args, flags.nrt
+    if case not in found:
+        sig = _search_call_type(self, context, args, kws)
+        found[case] = sig, self._impl_keys.get(sig.args)
+    sig, self._impl_keys[sig.args] = found[case]
+    return sig
+
+
+BaseFunction.get_call_type = _call_type
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Pause Python's search for unreachable cycles, which takes a seventh of a compilation's time.
+
+    A compilation creates millions of objects, and keeps most to its end.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 # numba measures the time in LLVM by two events a call, 110,000 before the first answer of `collide`, each
 # sent to all functions in work. Nobody reads it.
 llvm.ffi.lib._lock._cblist.clear()
-
-# Functions of numba's own library that a kernel calls are compiled without a wrapper for C, which nobody
-# calls.
-jit_registry[cpu_target] = functools.partial(jit_registry.pop(cpu_target), no_cfunc_wrapper=True)
 
 
 class _Pipeline(compiler.CompilerBase):  # type: ignore[misc]
@@ -169,12 +213,27 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
         """Do not look for numba's extensions before a call: compilation does, stored code needs none."""
 
 
-class InnerKernel(_Dispatcher):  # type: ignore[misc]
+class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
+    """Function of numba's own library, which only kernels and functions that numba compiles call."""
+
+    def __init__(self, function: Any, options: dict[str, Any], pipeline: Any = compiler.Compiler) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=pipeline)
+        self._compiler.__class__ = _InnerCompiler
+
+    def add_overload(self, cres: Any) -> None:
+        """Store the code for a signature."""
+        self.overloads[tuple(cres.signature.args)] = cres
+
+
+jit_registry.pop(cpu_target)
+jit_registry[cpu_target] = lambda **options: lambda function: _LibraryKernel(function, options)
+
+
+class InnerKernel(_LibraryKernel):
     """Function that only other kernels can call. Parameters as `Kernel`."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=_Pipeline)
-        self._compiler.__class__ = _InnerCompiler
+        super().__init__(function, options, _Pipeline)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.
@@ -185,14 +244,11 @@ class InnerKernel(_Dispatcher):  # type: ignore[misc]
             tuple(map(unliteral, args)), {name: unliteral(value) for name, value in kws.items()}
         )
 
-    def add_overload(self, cres: Any) -> None:
-        """Store the code for a signature."""
-        self.overloads[tuple(cres.signature.args)] = cres
-
 
 class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
     """numba's compiler of a function that Python calls."""
 
+    @_without_collector()
     def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
         flags = compiler.Flags()

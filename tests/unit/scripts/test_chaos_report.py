@@ -1,8 +1,8 @@
-"""Test that scripts/chaos notices a server's memory that grows, and only that."""
+"""Test that scripts/chaos notices a server's memory or threads that grow, and only those."""
 
 import numpy as np
 import pytest
-from chaos_cases.chaos_report import GROWTH
+from chaos_cases.chaos_report import GROWTH, _not_held
 from chaos_cases.server_restarts import SETTLED_SECONDS, Growth, QuietPoint, fit_growth
 from numpy.typing import NDArray
 
@@ -53,3 +53,17 @@ def test_too_few_quiet_points_have_no_growth() -> None:
     """Two quiet points have no interval."""
     two = [QuietPoint(1, age, age, {}, {}, 1, 0, 1) for age in (100.0, 120.0)]
     assert fit_growth(two) is None
+
+
+def test_threads_that_stay_are_noticed_and_a_peak_is_not() -> None:
+    """A thread that never ends raises the least number; one that follows the load does not."""
+
+    def judged(*pool: int, own: tuple[int, ...] = (2,) * 6) -> list[str]:
+        counts = zip(pool, own, strict=True)
+        return _not_held(
+            [{"app-0": number, "chaos": workers} for number, workers in counts], [{}] * len(pool)
+        )
+
+    assert judged(20, 21, 20, 23, 20, 30) == []
+    assert "the least number in the second half" in judged(20, 21, 20, 23, 24, 25)[0]
+    assert "'chaos'" in judged(20, 20, 20, 20, 20, 20, own=(2, 2, 2, 2, 2, 3))[0]

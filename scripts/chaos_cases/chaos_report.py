@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from .chaos_run import ChaosRun
 from .fixtures import judge_claims, whole_lines
-from .server_restarts import Growth, ServerRuns
+from .server_restarts import SETTLED_SECONDS, Growth, ServerRuns
 
 STOP_SECONDS = 2.0
 GROWTH = 1.0  # [MB a minute]
@@ -88,9 +88,11 @@ def _violations(report: dict[str, Any], run: ChaosRun, limits: Limits) -> list[s
                 f"SIGTERM: exit code {stop.code} after {stop.seconds:.2f} s, 0 within {limits.stop:g} expected"
             )
     growth = server_runs.growth()
+    last = [quiet for quiet in server_runs.quiet if quiet.life == server_runs.number]
     if growth is not None and growth.high > GROWTH:
         found.append(f"memory grows by {_in_words(growth)}: under {GROWTH:g} expected, with the interval")
-    last = [quiet for quiet in server_runs.quiet if quiet.life == server_runs.number]
+    elif growth is None and last and last[-1].age > 2 * SETTLED_SECONDS:
+        found.append(f"memory: {_in_words(growth)}")
     if last and last[-1].clients > run.ids:
         found.append(f"avatars of {last[-1].clients} clients at the end, of {run.ids} expected")
     # At the first quiet point of a server, something may not have been used yet.

@@ -183,10 +183,9 @@ class ServerRuns:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
-        while self._process.stdout.readline() != GIVEN_BACK:
-            self._process.poll()
-            if self._process.returncode is not None:
-                raise RuntimeError(f"the server ended: exit code {self._process.returncode}")
+        # Its other output may come first.
+        if GIVEN_BACK not in iter(self._process.stdout.readline, ""):
+            raise BrokenPipeError("the server has ended")
 
     def growth(self) -> Growth | None:
         """Return the growth of the last server's memory without that of avatars, once it has settled.

@@ -27,9 +27,13 @@ from .fixtures import GENERATIONS, SCENE, Fixture
 from .server_restarts import ServerRuns
 
 CLIENTS = 16
+# Share of a run in which servers are killed.
+DEADLY = 0.35
 # The last SEVERAL clients have IDS ids each.
 SEVERAL, IDS = 2, 6
-QUIET_EVERY = 30.0
+QUIET_EVERY = 15.0
+# A server is idle if it uses at most this share of a processor in this time [s]; how long to wait for that [s].
+IDLE_SHARE, IDLE_WINDOW, IDLE_SECONDS = 0.03, 1.0, 30.0
 READY_SECONDS = 60.0
 RIGHT_SECONDS = 20.0
 # Faults and their frequencies; SERVER_FAULTS only in the part of a run in which servers are killed.
@@ -40,11 +44,10 @@ FAULTS = {
 }  # fmt: skip
 
 
-# Faults that leave avatars behind, which the server keeps for a minute. At the end of each period of
-# the last server, none is injected for so long that the server has dropped them all [s]; its memory
-# is then measured.
+# Faults that leave avatars behind, which the server keeps for a minute. At the end of a run, none is
+# injected for so long that the server has dropped them all [s].
 LEAVES_AVATARS = ("invented", "heavy")
-PERIOD, CALM, DROPPED = 120.0, 75.0, 70.0
+CALM = 75.0
 
 
 def _forking() -> Any:
@@ -84,7 +87,9 @@ class ChaosRun:
         self.scoreboard = b.Scoreboard(folder / "board", clients)
         self.server_runs = ServerRuns(fixture, endpoint, self.scoreboard, folder / "server.log")
         self.done: Counter[str] = Counter()
+        # How long each client waited for a right answer [s]: after a restart, and with a server running.
         self.recovery: list[float] = []
+        self.waits: list[float] = []
         self.stuck: list[str] = []
         self.generation = 0
         self._context = _forking()
@@ -92,13 +97,17 @@ class ChaosRun:
         self._born: dict[int, float] = {}
         self._frozen: dict[int, float] = {}
         self._rogues: list[tuple[Any, float]] = []
-        self._disturbed = 0.0  # time of the last fault that leaves avatars behind
         self._faults = dict(FAULTS)
         for kind in [*without, *(() if has_strace() else ("read errors",))]:
             self._faults.pop(kind, None)
 
+    @property
+    def ids(self) -> int:
+        """Return the number of ids of all clients."""
+        return self.clients - SEVERAL + SEVERAL * IDS
+
     def run(self, seconds: float) -> None:
-        """Inject faults for `seconds`; servers are killed in the first 0.4 of it."""
+        """Inject faults for `seconds`; servers are killed in the first DEADLY of it."""
         self.scoreboard.driver[b.HEARTBEAT] = time.monotonic()
         threading.Thread(target=self._send_heartbeats, daemon=True).start()
         self._serve(0)
@@ -110,19 +119,14 @@ class ChaosRun:
                 lambda: all(self._client_row(slot)[b.RIGHT_AT] > 0 for slot in self._clients), READY_SECONDS
             )
             begin = time.monotonic()
-            quiet_at = begin + QUIET_EVERY / 3
-            periods = 0
+            quiet_at = begin + QUIET_EVERY
             while (now := time.monotonic()) < begin + seconds:
-                deadly = now < begin + 0.4 * seconds
-                lived = now - self.server_runs.serving_at
-                calm = not deadly and lived % PERIOD > PERIOD - CALM
+                deadly = now < begin + DEADLY * seconds
+                calm = now > begin + seconds - CALM
                 kinds = self._faults | (SERVER_FAULTS if deadly else {})
                 kinds = {
                     kind: often for kind, often in kinds.items() if not (calm and kind in LEAVES_AVATARS)
                 }
-                if not deadly and int(lived / PERIOD) > periods:
-                    self._record_quiet_point(calm=now - self._disturbed > DROPPED)
-                periods = int(lived / PERIOD)
                 kind = self.random.choices(list(kinds), list(kinds.values()))[0]
                 self.say(f"{now - begin:6.1f} s  {kind}")
                 self._inject(kind)
@@ -131,20 +135,20 @@ class ChaosRun:
                     self._record_quiet_point()
                     quiet_at = time.monotonic() + QUIET_EVERY
             self._heal()
-            self._recover(time.monotonic())
+            self._record_waits(self.waits, time.monotonic(), self._surviving())
         finally:
             self._end()
 
     def _inject(self, kind: str) -> None:
         """Inject one fault."""
         self.done[kind] += 1
-        if kind in LEAVES_AVATARS:
-            self._disturbed = time.monotonic()
         if kind in rogue_clients.ROGUE_CLIENTS:
             self._start_rogue(kind)
         elif kind == "kill server":
+            self._record_waits(self.waits, time.monotonic(), self._surviving())
             self._kill_server()
         elif kind == "terminate server":
+            self._record_waits(self.waits, time.monotonic(), self._surviving())
             self.server_runs.terminate()
             self._pause(self.random.uniform(0.0, 1.0))
             self._restart()
@@ -189,28 +193,31 @@ class ChaosRun:
 
     def _restart(self) -> None:
         """Start another server, and measure when its clients receive right answers again."""
-        surviving = [
-            slot for slot, row in ((slot, self._client_row(slot)) for slot in self._clients)
-            if row[b.RIGHT_AT] > self._born[slot] and slot not in self._frozen
-        ]  # fmt: skip
+        surviving = self._surviving()
         self.server_runs.start()
         self._serve(self.generation)
-        self._recover(self.server_runs.serving_at, surviving)
+        self._record_waits(self.recovery, self.server_runs.serving_at, surviving)
 
-    def _recover(self, since: float, slots: list[int] | None = None) -> None:
-        """Record how long after `since` each client received its first right answer."""
-        slots = [slot for slot in self._clients if slot not in self._frozen] if slots is None else slots
+    def _surviving(self) -> list[int]:
+        """Return the slots of the clients that are not frozen and have received a right answer."""
+        return [
+            slot for slot in self._clients
+            if self._client_row(slot)[b.RIGHT_AT] > self._born[slot] and slot not in self._frozen
+        ]  # fmt: skip
+
+    def _record_waits(self, waits: list[float], since: float, slots: list[int]) -> None:
+        """Add to `waits` how long after `since` each client received its first right answer [s]."""
         self._until(lambda: all(self._client_row(slot)[b.RIGHT_AT] > since for slot in slots), RIGHT_SECONDS)
         took: list[float] = []
         for slot in slots:
             at = float(self._client_row(slot)[b.RIGHT_AT])
-            took.append(max(0.0, at - since) if at > since else RIGHT_SECONDS)
+            took.append(at - since if at > since else RIGHT_SECONDS)
             if at <= since:
                 self.stuck.append(f"client {slot}: no right answer within {RIGHT_SECONDS:g} s of {since:.1f}")
         self.say(
-            "         right again after " + " ".join(f"{seconds:.1f}" for seconds in sorted(took)) + " s"
+            "         right answers after " + " ".join(f"{seconds:.1f}" for seconds in sorted(took)) + " s"
         )
-        self.recovery += took
+        waits += took
 
     # Generations
 
@@ -366,22 +373,36 @@ class ChaosRun:
             time.sleep(0.005)
         return True
 
-    def _record_quiet_point(self, *, calm: bool = False) -> None:
-        """Pause all clients, and record the server's resources.
-
-        calm: the server has dropped all unused avatars.
-        """
+    def _record_quiet_point(self) -> None:
+        """Pause all clients, and record the server's resources."""
         for slot in list(self._frozen):
             self._thaw(slot)
         self._until(lambda: not self._rogues, 15.0)
         self._until(lambda: all(row[b.RIGHT_AT] > self._born[s] for s, row in self._rows()), READY_SECONDS)
         self.scoreboard.driver[b.PAUSE] = 1
-        if self._until(lambda: all(row[b.IDLE] for _, row in self._rows()), 15.0):
-            self._pause(2.0)
-            self.server_runs.record_quiet_point(calm=calm)
-        else:
-            self.done["no quiet point"] += 1
+        idle = self._until(lambda: all(row[b.IDLE] for _, row in self._rows()), 15.0)
+        try:
+            recorded = idle and self._until_server_idle()
+            if recorded:
+                self.server_runs.record_quiet_point()
+        except (SolidcloudError, OSError):  # the server does not answer, or has ended
+            recorded = False
+        self.done["no quiet point"] += not recorded
         self.scoreboard.driver[b.PAUSE] = 0
+
+    def _until_server_idle(self) -> bool:
+        """Wait until the server uses no processor time; return whether it does.
+
+        It may still add a large avatar for a client that has ended.
+        """
+        before, deadline = self.server_runs.cpu_seconds(), time.monotonic() + IDLE_SECONDS
+        while time.monotonic() < deadline:
+            self._pause(IDLE_WINDOW)
+            now = self.server_runs.cpu_seconds()
+            if now - before <= IDLE_SHARE * IDLE_WINDOW:
+                return True
+            before = now
+        return False
 
     def _rows(self) -> list[tuple[int, Any]]:
         return [(slot, self._client_row(slot)) for slot in self._clients]

@@ -7,35 +7,58 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import t
+from solidcloud.server.client import Client
 
 from . import scoreboard as b
 from .fixtures import SCENE, Fixture
+from .measured_server import GIVEN_BACK
 
 START_SECONDS = 300.0  # the first start on a machine compiles
 STOP_SECONDS = 60.0
 WATCH_PERIOD = 0.5
+# A server's memory grows at first, as each kind of request and fault occurs once [s].
+SETTLED_SECONDS = 120.0
+CONFIDENCE = 0.95
+MEASURED_SERVER = Path(__file__).with_name("measured_server.py")
 
 
 class QuietPoint(NamedTuple):
     """Resources of a server while no client sends queries.
 
-    life: number of the server.  at: time [s].  threads: by name.  files: by kind or name.
-    rss: resident bytes.  of_files: those that belong to files, which the system may reclaim.
-    calm: whether the server had dropped all unused avatars.
+    life: number of the server.  at, age: time and time since it serves [s].
+    threads: by name.  files: by kind or name.
+    memory: resident bytes that do not belong to files, once freed memory was given back.
+    avatars: those of it that belong to avatars.  clients: number of clients with avatars.
     """
 
     life: int
     at: float
+    age: float
     threads: dict[str, int]
     files: dict[str, int]
-    rss: int
-    of_files: int
-    calm: bool
+    memory: int
+    avatars: int
+    clients: int
+
+
+class Growth(NamedTuple):
+    """Growth of a server's memory [MB a minute]: a fit, and the ends of its confidence interval.
+
+    minutes, points: how long and how often the memory was measured.
+    """
+
+    rate: float
+    low: float
+    high: float
+    minutes: float
+    points: int
 
 
 class Shutdown(NamedTuple):
@@ -71,9 +94,11 @@ class ServerRuns:
         """Start a server, and return when it serves."""
         self._tell(up=True)
         self.number += 1
-        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(self.fixture.live)]
+        command = [sys.executable, "-P", str(MEASURED_SERVER), "serve", str(self.fixture.live)]
         command += ["--name", SCENE, "--listen", self.endpoint, "--cache", str(self.fixture.cache)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self.log, text=True)
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.log, text=True
+        )
         timer = threading.Timer(START_SECONDS, process.kill)
         timer.start()
         assert process.stdout is not None
@@ -116,40 +141,65 @@ class ServerRuns:
         self.stops.append(Shutdown(begin, time.monotonic() - begin, code))
         self._mark_ended()
 
+    def cpu_seconds(self) -> float:
+        """Return the processor time that the server has used [s]."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        user, system = fields[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
     def hang_up(self) -> None:
         """Make the server reload, by SIGHUP."""
         os.kill(self.pid, signal.SIGHUP)
 
-    def record_quiet_point(self, *, calm: bool) -> None:
-        """Record the server's resources while no client sends queries. calm: see `QuietPoint`."""
+    def record_quiet_point(self) -> None:
+        """Record the server's resources while no client sends queries."""
         folder = Path("/proc") / str(self.pid)
         threads = Counter((task / "comm").read_text().strip() for task in (folder / "task").iterdir())
         files: Counter[str] = Counter()
         for entry in (folder / "fd").iterdir():
             with suppress(OSError):  # closed meanwhile
                 files[entry.readlink().name.partition(":")[0]] += 1
+        with Client(self.endpoint, scene=SCENE) as client:
+            avatars = client.stats().avatars
+        self._give_back_memory()
+        resident, of_files = _resident(self.pid)
+        at = time.monotonic()
         self.quiet.append(
-            QuietPoint(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid), calm)
+            QuietPoint(
+                life=self.number,
+                at=at,
+                age=at - self.serving_at,
+                threads=dict(threads),
+                files=dict(files),
+                memory=resident - of_files,
+                avatars=avatars.bytes,
+                clients=avatars.clients,
+            )
         )
 
-    def slope(self) -> tuple[float, float] | None:
-        """Return the growth of the last server's memory [MB a minute], and the minutes it was observed.
+    def _give_back_memory(self) -> None:
+        """Make the server give back freed memory to the system."""
+        assert self._process is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        # Its other output may come first.
+        if GIVEN_BACK not in iter(self._process.stdout.readline, ""):
+            raise BrokenPipeError("the server has ended")
 
-        Memory of files is excluded. Only calm quiet points count. None: there are too few of them, or
-        they are less than a minute apart.
+    def growth(self) -> Growth | None:
+        """Return the growth of the last server's memory without that of avatars, once it has settled.
+
+        None: there are too few quiet points.
         """
-        seen = np.array(
-            [(q.at, q.rss - q.of_files) for q in self.quiet if q.life == self.number and q.calm], np.float64
-        ).reshape(-1, 2)
-        if len(seen) < 2 or seen[-1, 0] - seen[0, 0] < 60:
-            return None
-        rate = np.polyfit(seen[:, 0] - seen[0, 0], seen[:, 1], 1)[0]
-        return float(rate * 60 / 1e6), float(seen[-1, 0] - seen[0, 0]) / 60
+        return fit_growth([q for q in self.quiet if q.life == self.number])
 
     def _mark_ended(self) -> None:
         """Tell the clients that no server is up."""
-        assert self._process is not None and self._process.stdout is not None
+        assert self._process is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdout.close()
+        self._process.stdin.close()
         self._process = None
         self._tell(up=False)
 
@@ -167,6 +217,25 @@ class ServerRuns:
                     if rss := _resident(process.pid)[0]:  # 0: it has ended
                         self.memory.append((self.number, time.monotonic(), rss))
             time.sleep(WATCH_PERIOD)
+
+
+def fit_growth(quiet: Sequence[QuietPoint]) -> Growth | None:
+    """Return the growth of a server's memory without that of avatars, once it has settled.
+
+    quiet: quiet points of one server. None: there are fewer than three after SETTLED_SECONDS.
+    """
+    settled = [each for each in quiet if each.age >= SETTLED_SECONDS]
+    if len(settled) < 3:
+        return None
+    minutes = np.array([each.age for each in settled]) / 60
+    megabytes = np.array([each.memory - each.avatars for each in settled]) / 1e6
+    slope, start = np.polyfit(minutes, megabytes, 1)
+    freedom = len(settled) - 2
+    variance = np.sum((megabytes - start - slope * minutes) ** 2) / freedom
+    error = np.sqrt(variance / np.sum((minutes - minutes.mean()) ** 2))
+    margin = float(t.ppf((1 + CONFIDENCE) / 2, freedom) * error)
+    rate = float(slope)
+    return Growth(rate, rate - margin, rate + margin, float(np.ptp(minutes)), len(settled))
 
 
 def _resident(process: int) -> tuple[int, int]:

@@ -185,18 +185,20 @@ def find_unknown_regions(box, first, last, avatar, units, scene, tree, until, sp
     inf if it never does.
     The reach is the cube around the avatar's root sphere, as in `collide`, along chords; neither
     result depends on voxels. Once the scene's stop flag is set, motions are unknown from their
-    beginning. space: scratch.
+    beginning; `outside` is then examined only where a contact was found after a short way: such a
+    contact may be exact, whatever is unknown. space: scratch.
     """
     begin, end = space.begin, space.end
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)
         outside[i], unknown_from[i] = False, INFINITE
-        if stopped(scene.stop):
-            unknown_from[i] = 0.0
-            continue
         size = avatar_size(box, units[i])
         parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1
         parts = 1 if motion.bend == 0.0 else parts
+        if stopped(scene.stop):
+            unknown_from[i] = 0.0
+            if until[i] >= 1.0 or parts > 2:
+                continue
         for part in range(parts):
             t0, t1 = until[i] * part / parts, until[i] * (part + 1) / parts
             span = _reach_of_part(motion, t0, t1, avatar, units[i], scene, space)

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 import stopped_queries
 import synthetic_scans
+from solidcloud.schemas.archive.units import UNITS_PER_METRE
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import sweep as sweep_module
 from solidcloud.server.queries.query_inputs import EXACT, QueryBudget, with_stop
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.residency.voxel_cache import VoxelCache
@@ -76,6 +79,35 @@ def test_a_stopped_motion_inside_is_not_said_to_leave(asked: Asked) -> None:
         found = sweep(with_stop(data, stop), ball, pose, pose, budget=effort_of(stop))
         assert found.outside.tolist() == [False]
     assert found.lower.tolist() == [0.0] and found.verdict.tolist() == [UNKNOWN]
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("gap", [0.0, 0.005])
+def test_a_stop_after_a_contact_leaves_its_row_as_it_is(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, gap: float
+) -> None:
+    """A contact within the tolerance of the beginning is exact, so `outside` must be right too.
+
+    gap: of the avatar from a point at the boundary of the scene [m].
+    """
+    case = contact_cases.open_case(tmp_path, synthetic_scans.make_scan("noise", 2, 120), rng, scan_count=2)
+    data, ball, stop = case.data, make_avatar([[0.0, 0, 0]], 0.001), StopFlag()
+    begin, end = np.eye(4)[None], np.eye(4)[None]
+    end[0, :3, 3] = begin[0, :3, 3] = case.points[case.points[:, 0].argmin()]
+    begin[0, 0, 3] -= 0.001 + data.radius_units / UNITS_PER_METRE + gap if gap else 0.0
+    known = sweep(data, ball, begin, end, tolerance=0.02)
+    assert known.outside.tolist() == known.exact.tolist() == [True]
+    find = sweep_module.find_unknown_regions
+
+    def find_later(*arguments: Any) -> None:
+        stop.set(WHY)
+        find(*arguments)
+
+    monkeypatch.setattr(sweep_module, "find_unknown_regions", find_later)
+    found = sweep(with_stop(data, stop), ball, begin, end, tolerance=0.02, budget=effort_of(stop))
+    assert found.verdict.tolist() == known.verdict.tolist() == [Verdict.CONTACT]
+    assert found.lower.tolist() == [0.0] and found.upper.tolist() == known.upper.tolist()
+    assert found.outside.tolist() == found.exact.tolist() == [True]
 
 
 @pytest.mark.interpreted

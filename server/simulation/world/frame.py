@@ -4,7 +4,7 @@ Vectors and rotations are computed with Python's floats, or by numpy element by 
 order of operations. numpy multiplies matrices with a library whose order of sums and use of fused
 operations depend on the processor: the same motion commands could give other poses on another
 machine. No library guarantees the bits of a sine either. For three numbers this is also faster: a
-product by numpy takes a microsecond. kernels/motion/vectors.py has the same in compiled code.
+product by numpy takes a microsecond. kernels/motion/vector_tuples.py has the same in compiled code.
 """
 
 import math

@@ -96,7 +96,7 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     case = context, args, flags.nrt
     if case not in found:
         sig = _search_call_type(self, context, args, kws)
-        found[case] = sig, self._impl_keys.get(sig.args)
+        found[case] = sig, self._impl_keys[sig.args]
     sig, self._impl_keys[sig.args] = found[case]
     return sig
 
@@ -105,18 +105,19 @@ BaseFunction.get_call_type = _call_type
 
 
 @contextlib.contextmanager
-def _without_collector() -> Iterator[None]:
-    """Pause Python's search for unreachable cycles, which takes a seventh of a compilation's time.
+def _with_rare_searches() -> Iterator[None]:
+    """Make Python search for unreachable cycles less often.
 
-    A compilation creates millions of objects, and keeps most to its end.
+    A compilation creates millions of objects and keeps most to its end. The searches took a seventh of
+    its time and take a twentieth, the longest 0.2 s, as before. Without any, the one after the largest
+    kernel stops all threads for more than a second.
     """
-    enabled = gc.isenabled()
-    gc.disable()
+    before = gc.get_threshold()
+    gc.set_threshold(20_000, 20, 100)
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
+        gc.set_threshold(*before)
 
 
 # numba measures the time in LLVM by two events a call, 110,000 before the first answer of `collide`, each
@@ -258,7 +259,7 @@ class InnerKernel(_LibraryKernel):
 class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
     """numba's compiler of a function that Python calls."""
 
-    @_without_collector()
+    @_with_rare_searches()
     def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
         flags = compiler.Flags()

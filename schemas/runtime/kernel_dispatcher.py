@@ -17,7 +17,7 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
+- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
   and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of
   numba's own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
@@ -76,24 +76,25 @@ def _values(self: Any) -> dict[str, Any]:
 # operation, 140,000 times before the first answer of `collide`: 5 s of 38.
 compiler.Flags.values = _values
 
-
 # Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
 # the same as what Python code of `abc` finds.
 _TypeMetaclass.__instancecheck__ = type.__instancecheck__
+
 _search_call_type = BaseFunction.get_call_type
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """Return the signature of a call of a function of numba's own library.
 
-    numba tries all implementations for each call. Four of five calls are of a function and of types that
-    were met before, with the same counting of references, for which an implementation is compiled.
+    numba tries all implementations for each call. Most calls are of a function and of types that were met
+    before. The options of the caller take part, because its callees inherit them: a function that somebody
+    else compiles with `fastmath` leaves no trace in a kernel.
     """
     flags = ConfigStack.top_or_none()
     if kws or flags is None:
         return _search_call_type(self, context, args, kws)
     found = self.__dict__.setdefault("_found_calls", {})
-    case = context, args, flags.nrt
+    case = context, args, str(flags._values)
     if case not in found:
         sig = _search_call_type(self, context, args, kws)
         found[case] = sig, self._impl_keys[sig.args]

@@ -17,7 +17,7 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
+- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
   and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of
   numba's own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
@@ -76,27 +76,28 @@ def _values(self: Any) -> dict[str, Any]:
 # operation, 140,000 times before the first answer of `collide`: 5 s of 38.
 compiler.Flags.values = _values
 
-
 # Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
 # the same as what Python code of `abc` finds.
 _TypeMetaclass.__instancecheck__ = type.__instancecheck__
+
 _search_call_type = BaseFunction.get_call_type
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """Return the signature of a call of a function of numba's own library.
 
-    numba tries all implementations for each call. Four of five calls are of a function and of types that
-    were met before, with the same counting of references, for which an implementation is compiled.
+    numba tries all implementations for each call. Most calls are of a function and of types that were met
+    before. The options of the caller take part, because its callees inherit them: a function that somebody
+    else compiles with `fastmath` leaves no trace in a kernel.
     """
     flags = ConfigStack.top_or_none()
     if kws or flags is None:
         return _search_call_type(self, context, args, kws)
     found = self.__dict__.setdefault("_found_calls", {})
-    case = context, args, flags.nrt
+    case = context, args, str(flags._values)
     if case not in found:
         sig = _search_call_type(self, context, args, kws)
-        found[case] = sig, self._impl_keys.get(sig.args)
+        found[case] = sig, self._impl_keys[sig.args]
     sig, self._impl_keys[sig.args] = found[case]
     return sig
 
@@ -105,18 +106,19 @@ BaseFunction.get_call_type = _call_type
 
 
 @contextlib.contextmanager
-def _without_collector() -> Iterator[None]:
-    """Pause Python's search for unreachable cycles, which takes a seventh of a compilation's time.
+def _with_rare_searches() -> Iterator[None]:
+    """Make Python search for unreachable cycles less often.
 
-    A compilation creates millions of objects, and keeps most to its end.
+    A compilation creates millions of objects and keeps most to its end. The searches took a seventh of
+    its time and take a twentieth, the longest 0.2 s, as before. Without any, the one after the largest
+    kernel stops all threads for more than a second.
     """
-    enabled = gc.isenabled()
-    gc.disable()
+    before = gc.get_threshold()
+    gc.set_threshold(20_000, 20, 100)
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
+        gc.set_threshold(*before)
 
 
 # numba measures the time in LLVM by two events a call, 110,000 before the first answer of `collide`, each
@@ -214,10 +216,15 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
 
 
 class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
-    """Function of numba's own library, which only kernels and functions that numba compiles call."""
+    """Function of numba's own library, which only kernels and functions that numba compiles call.
 
-    def __init__(self, function: Any, options: dict[str, Any], pipeline: Any = compiler.Compiler) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=pipeline)
+    function: its source.  options: numba's.  types: of its variables, by name.  pipeline: of numba's passes.
+    """
+
+    def __init__(
+        self, function: Any, options: dict[str, Any], types: Any = None, pipeline: Any = compiler.Compiler
+    ) -> None:
+        super().__init__(function, types, options, pipeline)
         self._compiler.__class__ = _InnerCompiler
 
     def add_overload(self, cres: Any) -> None:
@@ -225,15 +232,20 @@ class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
         self.overloads[tuple(cres.signature.args)] = cres
 
 
-jit_registry.pop(cpu_target)
-jit_registry[cpu_target] = lambda **options: lambda function: _LibraryKernel(function, options)
+def _library_kernel(locals: Any = None, **options: Any) -> Callable[[Any], _LibraryKernel]:
+    """Return the decorator of functions of numba's own library."""
+    return lambda function: _LibraryKernel(function, options, locals)
+
+
+del jit_registry[cpu_target]
+jit_registry[cpu_target] = _library_kernel
 
 
 class InnerKernel(_LibraryKernel):
     """Function that only other kernels can call. Parameters as `Kernel`."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, options, _Pipeline)
+        super().__init__(function, options, pipeline=_Pipeline)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.
@@ -248,7 +260,7 @@ class InnerKernel(_LibraryKernel):
 class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
     """numba's compiler of a function that Python calls."""
 
-    @_without_collector()
+    @_with_rare_searches()
     def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
         flags = compiler.Flags()

@@ -2,6 +2,7 @@
 
 import os
 
+import numba
 import numpy as np
 import pytest
 from solidcloud.schemas.kernels.morton import morton_code, morton_encode
@@ -62,3 +63,17 @@ def test_what_calls_is_linked_before_what_it_calls() -> None:
     for callees in (library.callees, library.callees[::-1]):
         assert [each.name for each in in_order(callees)] == ["quarter", "half"]
     assert eighth(4.0) == 0.5
+
+
+@njit()
+def middle(values):  # type: ignore[no-untyped-def]
+    """Return the median."""
+    return np.median(values)
+
+
+def test_functions_that_numba_compiles_share_its_library_with_kernels() -> None:
+    """The library's functions have no machine code of their own, whichever calls them first."""
+    values = np.array([3.0, 1.0, 2.0])
+    plain = numba.njit(lambda array: (np.median(array), np.sort(array)[0]))
+    assert middle(values) == 2.0
+    assert plain(values) == (2.0, 1.0)

@@ -28,7 +28,7 @@ compiler may move an ordinary load out of a loop, but not an atomic one. An atom
 same as an ordinary load.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,4 +274,4 @@ def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
 
 
 # stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
-stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
+stopped: Any = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped

@@ -295,8 +295,7 @@ def _measure(avatar, m, block, lane, shift, scene, record):
     """
     center = place_units(avatar.points, m, shift, block, lane)
     point = (record[0, POINT], record[0, POINT + 1], record[0, POINT + 2])
-    for r in range(3):
-        record[0, CENTER + r] = center[r]
+    record[0, CENTER], record[0, CENTER + 1], record[0, CENTER + 2] = center
     record[0, SQUARE] = square_apart(center, point, scene.units_per_step)
     return record[0, SQUARE]
 

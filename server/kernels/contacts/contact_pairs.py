@@ -1,7 +1,7 @@
 """All pairs of points in contact under a pose: a complete joint descent of two hierarchies.
 
-The descent is that of collide_poses.py ([Fig12] section 6, corrected), but it does not end early:
-it examines every pair of leaf nodes whose bounds meet. There a float32 pass certifies most pairs as
+The descent is that of [Fig12] section 6, corrected as in collide_poses.py, and does not end early: it
+examines every pair of leaf nodes whose bounds meet. There a float32 pass certifies most pairs as
 near or far. Integers (NUMERICS.md N5) decide the pairs between, and measure those pairs that may be
 the deepest of their cell or among the deepest listed.
 

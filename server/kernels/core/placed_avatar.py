@@ -340,13 +340,12 @@ def square_apart(center, point, units_per_step):
     Returns -1 where they are farther apart along an axis than any reach, MAX_REACH_UNITS; squares
     therefore fit 63 bits.
     """
-    square = np.int64(0)
-    for r in range(3):
-        difference = center[r] - lattice_to_units(point[r], units_per_step)
-        if abs(difference) > MAX_REACH_UNITS:
-            return np.int64(-1)
-        square += difference * difference
-    return square
+    dx = center[0] - lattice_to_units(point[0], units_per_step)
+    dy = center[1] - lattice_to_units(point[1], units_per_step)
+    dz = center[2] - lattice_to_units(point[2], units_per_step)
+    if abs(dx) > MAX_REACH_UNITS or abs(dy) > MAX_REACH_UNITS or abs(dz) > MAX_REACH_UNITS:
+        return np.int64(-1)
+    return dx * dx + dy * dy + dz * dz
 
 
 @njit_no_refcount

@@ -278,8 +278,8 @@ def _update_best(
         if order > 0 or (order == 0 and point + center >= known):
             return
     found[0], found[7] = square, deficit
-    for r in range(3):
-        found[1 + r], found[4 + r] = point[r], center[r]
+    found[1], found[2], found[3] = point
+    found[4], found[5], found[6] = center
 
 
 @njit_no_refcount

@@ -52,7 +52,7 @@ MAX_SKIN_FACTOR = 4.0
 
 
 class OneMotion(NamedTuple):
-    """Arrays of one motion, as those of k in sweep_segments.py and sweep_advance.py; scratch.
+    """Arrays of one motion, as those of k in sweep_segments.py; scratch.
 
     first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.  origin: (3,), zero.
     The others are (1,).

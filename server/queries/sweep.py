@@ -175,18 +175,8 @@ def sweep_steps(
     until = np.minimum(progress.upper, 1.0)
     unknown = np.empty(k)
     find_unknown_regions(
-        box,
-        first,
-        last,
-        avatar.arrays,
-        units,
-        data.arrays,
-        data.tree,
-        until,
-        make_plan_space(),
-        outside,
-        unknown,
-    )
+        box, first, last, avatar.arrays, units, data.arrays, data.tree, until, make_plan_space(), outside, unknown
+    )  # fmt: skip
     if data.nothing_clear:
         unknown[:] = 0.0
     met = unknown <= until

@@ -1,4 +1,4 @@
-"""Screw motions and the time of first contact along them.
+"""Vectors, screw motions, and the time of first contact along them.
 
 May import server.kernels.core, schemas.
 Begin with screw_motion.py.

@@ -158,7 +158,8 @@ def dot(one: Vec, other: Vec) -> float:
 
 def norm(vector: Vec) -> float:
     """Return the length of a vector (3,)."""
-    return math.sqrt(dot(vector, vector))
+    x, y, z = vector.tolist()
+    return math.sqrt(x * x + y * y + z * z)
 
 
 def unit_vector(vector: tuple[float, float, float]) -> Vec:

@@ -22,7 +22,7 @@ _NAME = re.compile(rb"\w+")
 Parts = tuple[str, ...]
 
 # Modules that control what is cached, and do not affect compiled code.
-_APART = frozenset({("schemas", "kernels", "kernel_files"), ("schemas", "kernels", "kernel_sources")})
+_APART = frozenset({("schemas", "runtime", "kernel_files"), ("schemas", "runtime", "kernel_sources")})
 
 
 class _Source(NamedTuple):

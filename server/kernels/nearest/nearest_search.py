@@ -330,7 +330,7 @@ def _write_result(nearest, i, radii, reach, scene, result):
 
     radii: sum of the largest radii of avatar and scan, exact units.  reach: the largest distance
     requested [m], which may exceed the same in exact units by a rounding.
-    queries/context/queries/distance.py defines the signed distance, in this order of operations.
+    queries/distance.py defines the signed distance, in this order of operations.
     """
     square, pair, deficit, signed = nearest.square[i], nearest.pair[i], nearest.deficit[i], np.inf
     for at in range(NORMAL, COLUMNS):

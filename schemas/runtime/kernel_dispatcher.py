@@ -17,9 +17,9 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
-  and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of
-  numba's own library are compiled;
+- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones
+  take the place, and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how
+  functions of numba's own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """

@@ -53,6 +53,8 @@ config: Any = numba_config
 compiler: Any = numba.core.compiler
 dispatcher: Any = numba.core.dispatcher
 _Dispatcher: Any = CPUDispatcher
+_Function: Any = BaseFunction
+_Type: Any = _TypeMetaclass
 
 # LLVM's names of families of processors, the best first: what a processor has to have, and features
 # that differ from the name's. AVX-512 is a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and
@@ -78,9 +80,9 @@ compiler.Flags.values = _values
 
 # Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
 # the same as what Python code of `abc` finds.
-_TypeMetaclass.__instancecheck__ = type.__instancecheck__
+_Type.__instancecheck__ = type.__instancecheck__
 
-_search_call_type = BaseFunction.get_call_type
+_search_call_type = _Function.get_call_type
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -102,7 +104,7 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return sig
 
 
-BaseFunction.get_call_type = _call_type
+_Function.get_call_type = _call_type
 
 
 @contextlib.contextmanager

@@ -17,9 +17,9 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones take the place,
-  and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of
-  numba's own library are compiled;
+- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones
+  take the place, and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how
+  functions of numba's own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
@@ -53,6 +53,8 @@ config: Any = numba_config
 compiler: Any = numba.core.compiler
 dispatcher: Any = numba.core.dispatcher
 _Dispatcher: Any = CPUDispatcher
+_Function: Any = BaseFunction
+_Type: Any = _TypeMetaclass
 
 # LLVM's names of families of processors, the best first: what a processor has to have, and features
 # that differ from the name's. AVX-512 is a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and
@@ -78,9 +80,9 @@ compiler.Flags.values = _values
 
 # Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
 # the same as what Python code of `abc` finds.
-_TypeMetaclass.__instancecheck__ = type.__instancecheck__
+_Type.__instancecheck__ = type.__instancecheck__
 
-_search_call_type = BaseFunction.get_call_type
+_search_call_type = _Function.get_call_type
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -102,7 +104,7 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return sig
 
 
-BaseFunction.get_call_type = _call_type
+_Function.get_call_type = _call_type
 
 
 @contextlib.contextmanager

@@ -17,9 +17,9 @@ version: see pyproject.toml. They are:
   steps of `finalize`; numba's object cache, which takes machine code in place of its own;
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
-- `Flags.values` and `_values`, `BaseFunction.get_call_type` and `_TypeMetaclass`, of which faster ones
-  take the place, and the callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how
-  functions of numba's own library are compiled;
+- `Flags.values` and `_values`, and `BaseFunction.get_call_type`, of which faster ones take the place; the
+  callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of numba's
+  own library are compiled;
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
@@ -44,7 +44,6 @@ from numba.core.target_extension import cpu_target, jit_registry
 from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NopythonRewrites
 from numba.core.types import unliteral
-from numba.core.types.abstract import _TypeMetaclass
 from numba.core.types.functions import BaseFunction
 from numba.core.untyped_passes import InlineClosureLikes
 
@@ -54,7 +53,6 @@ compiler: Any = numba.core.compiler
 dispatcher: Any = numba.core.dispatcher
 _Dispatcher: Any = CPUDispatcher
 _Function: Any = BaseFunction
-_Type: Any = _TypeMetaclass
 
 # LLVM's names of families of processors, the best first: what a processor has to have, and features
 # that differ from the name's. AVX-512 is a family of its own: with x86-64-v3 a Zen 5 takes 1.08 and
@@ -77,10 +75,6 @@ def _values(self: Any) -> dict[str, Any]:
 # The same values as numba's, in a tenth of the time. numba compares them whenever it types an
 # operation, 140,000 times before the first answer of `collide`: 5 s of 38.
 compiler.Flags.values = _values
-
-# Types are instances of an abstract class, and no class is registered as one of them: what `type` finds is
-# the same as what Python code of `abc` finds.
-_Type.__instancecheck__ = type.__instancecheck__
 
 _search_call_type = _Function.get_call_type
 

@@ -8,7 +8,6 @@ or merged.
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,13 +51,18 @@ def hold_archives(
 
     radius_model: see schemas/archive/radius_model.py; None: that of each archive. Raise BadRequestError.
     """
-    held: list[HeldArchive] = []
-    with ExitStack() as stack:
+    taken: list[ArchiveGeneration] = []
+    try:
         for placed in archives:
-            opened = stack.enter_context(placed.take())
-            held.append(HeldArchive(placed, opened, with_stop(opened.radius_model(radius_model), stop)))
-        stack.pop_all()
-    return held
+            taken.append(placed.take())
+        return [
+            HeldArchive(placed, opened, with_stop(opened.radius_model(radius_model), stop))
+            for placed, opened in zip(archives, taken, strict=True)
+        ]
+    except BaseException:
+        for opened in taken:
+            opened.release()
+        raise
 
 
 def release(held: Sequence[HeldArchive]) -> None:

@@ -86,7 +86,7 @@ class FrameMemory(threading.local):
     """State of a frame of each thread.
 
     memory: its arrays.  reference: to them, for the kernel.  tape, log, question, before, state, hits:
-    the fields of each record of them.
+    the fields of each record of them.  state_bytes: `state` as bytes.
     """
 
     def __init__(self) -> None:
@@ -113,6 +113,7 @@ class FrameMemory(threading.local):
         self.memory, self.reference = memory, state.refer_to_memory(memory)
         self.tape, self.log, self.question = map(_fields_of, (memory.tape, memory.log, memory.question))
         self.before, self.state, self.hits = map(_fields_of, (memory.before, memory.state, memory.hits))
+        self.state_bytes = memory.state.view(np.uint8)
 
     def grow(self) -> None:
         """Double the rows of the tape."""
@@ -135,7 +136,7 @@ class WalkCall:
         frame, body, thread, memory = self._frame, self._frame.body, self._thread, self._thread.memory
         before, now, count = thread.before, thread.state, len(frame.hits)
         memory.begin[:], memory.target[:], memory.poses[0] = body.pose, frame.target, frame.pose
-        memory.state[0] = np.zeros((), memory.state.dtype)
+        thread.state_bytes.fill(0)
         now.row[0], now.hits[0], now.blocked[0], now.stepped[0] = count, count, -1, math.nan
         now.verdict[0], now.clear[0] = int(frame.verdict), frame.clear
         before.seconds[0], before.fall_speed[0], before.stood[0] = (
@@ -149,8 +150,8 @@ class WalkCall:
             before.plane[0] = plane.reshape(2, 3)
         if raised is not None:
             before.raised_at[0] = raised
-        thread.hits.row[:count], thread.hits.has_normal[:count] = range(count), False
         for row, hit in enumerate(frame.hits):
+            thread.hits.row[row], thread.hits.has_normal[row] = row, False
             self._write_hit(row, hit)
         thread.log.known[0] = count
 

@@ -212,15 +212,10 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
 
 
 class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
-    """Function of numba's own library, which only kernels and functions that numba compiles call.
+    """Function of numba's own library, which only kernels and functions that numba compiles call."""
 
-    function: its source.  options: numba's.  types: of its variables, by name.  pipeline: of numba's passes.
-    """
-
-    def __init__(
-        self, function: Any, options: dict[str, Any], types: Any = None, pipeline: Any = compiler.Compiler
-    ) -> None:
-        super().__init__(function, types, options, pipeline)
+    def __init__(self, function: Any, options: dict[str, Any], pipeline: Any = compiler.Compiler) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=pipeline)
         self._compiler.__class__ = _InnerCompiler
 
     def add_overload(self, cres: Any) -> None:
@@ -228,20 +223,15 @@ class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
         self.overloads[tuple(cres.signature.args)] = cres
 
 
-def _library_kernel(locals: Any = None, **options: Any) -> Callable[[Any], _LibraryKernel]:
-    """Return the decorator of functions of numba's own library."""
-    return lambda function: _LibraryKernel(function, options, locals)
-
-
-del jit_registry[cpu_target]
-jit_registry[cpu_target] = _library_kernel
+jit_registry.pop(cpu_target)
+jit_registry[cpu_target] = lambda **options: lambda function: _LibraryKernel(function, options)
 
 
 class InnerKernel(_LibraryKernel):
     """Function that only other kernels can call. Parameters as `Kernel`."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, options, pipeline=_Pipeline)
+        super().__init__(function, options, _Pipeline)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.

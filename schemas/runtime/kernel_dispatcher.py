@@ -18,8 +18,8 @@ version: see pyproject.toml. They are:
 - `_Cache`, the interface of numba's cache of a function, and `dumps`;
 - `PassManager.passes`, from which `_Pipeline` takes some away;
 - `Flags.values` and `_values`, and `BaseFunction.get_call_type`, of which faster ones take the place; the
-  callbacks of llvmlite's lock, which are removed; `jit_registry`, which says how functions of numba's
-  own library are compiled;
+  callbacks of llvmlite's lock, which are removed; the options of functions of numba's own library
+  (`jit_registry`);
 - `JITCPUCodegen` and its methods that name the processor, for code that another processor of the
   family can run; functions of numba's that a kernel calls are linked as LLVM code.
 """
@@ -121,6 +121,10 @@ def _with_rare_searches() -> Iterator[None]:
 # sent to all functions in work. Nobody reads it.
 llvm.ffi.lib._lock._cblist.clear()
 
+# Functions of numba's own library that a kernel calls are compiled without a wrapper for C, which nobody
+# calls.
+jit_registry[cpu_target] = functools.partial(jit_registry.pop(cpu_target), no_cfunc_wrapper=True)
+
 
 class _Pipeline(compiler.CompilerBase):  # type: ignore[misc]
     """numba's passes but for those of closures and of array expressions, which no kernel has."""
@@ -211,27 +215,12 @@ class Kernel(_Dispatcher):  # type: ignore[misc]
         """Do not look for numba's extensions before a call: compilation does, stored code needs none."""
 
 
-class _LibraryKernel(_Dispatcher):  # type: ignore[misc]
-    """Function of numba's own library, which only kernels and functions that numba compiles call."""
-
-    def __init__(self, function: Any, options: dict[str, Any], pipeline: Any = compiler.Compiler) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=pipeline)
-        self._compiler.__class__ = _InnerCompiler
-
-    def add_overload(self, cres: Any) -> None:
-        """Store the code for a signature."""
-        self.overloads[tuple(cres.signature.args)] = cres
-
-
-jit_registry.pop(cpu_target)
-jit_registry[cpu_target] = lambda **options: lambda function: _LibraryKernel(function, options)
-
-
-class InnerKernel(_LibraryKernel):
+class InnerKernel(_Dispatcher):  # type: ignore[misc]
     """Function that only other kernels can call. Parameters as `Kernel`."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, options, _Pipeline)
+        super().__init__(function, targetoptions=options, pipeline_class=_Pipeline)
+        self._compiler.__class__ = _InnerCompiler
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the type of a call. A constant is a value like any other.
@@ -241,6 +230,10 @@ class InnerKernel(_LibraryKernel):
         return super().get_call_template(
             tuple(map(unliteral, args)), {name: unliteral(value) for name, value in kws.items()}
         )
+
+    def add_overload(self, cres: Any) -> None:
+        """Store the code for a signature."""
+        self.overloads[tuple(cres.signature.args)] = cres
 
 
 class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]

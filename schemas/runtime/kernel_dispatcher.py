@@ -28,6 +28,7 @@ import contextlib
 import functools
 import gc
 import pickle
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
@@ -77,6 +78,8 @@ def _values(self: Any) -> dict[str, Any]:
 compiler.Flags.values = _values
 
 _search_call_type = _Function.get_call_type
+# Not an attribute of the function's type, which is pickled with code that a user caches.
+_found_calls: weakref.WeakKeyDictionary[Any, dict[Any, Any]] = weakref.WeakKeyDictionary()
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -87,9 +90,9 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     else compiles with `fastmath` leaves no trace in a kernel.
     """
     flags = ConfigStack.top_or_none()
-    if kws or flags is None:
+    if kws or flags is None or not isinstance(args, tuple):  # numba passes lists too
         return _search_call_type(self, context, args, kws)
-    found = self.__dict__.setdefault("_found_calls", {})
+    found = _found_calls.setdefault(self, {})
     case = context, args, str(flags._values)
     if case not in found:
         sig = _search_call_type(self, context, args, kws)
@@ -110,7 +113,8 @@ def _with_rare_searches() -> Iterator[None]:
     kernel stops all threads for more than a second.
     """
     before = gc.get_threshold()
-    gc.set_threshold(20_000, 20, 100)
+    if before[0]:  # 0: this process has none
+        gc.set_threshold(20_000, 20, 100)
     try:
         yield
     finally:

@@ -111,7 +111,12 @@ def collide_fast(
     """Answer `collide`, in one kernel call if there is one pose and the fast path applies."""
     begin = time.perf_counter()
     array = kernel_poses(poses)
-    if len(array) != 1 or len(avatar.points) > MAX_FAST_POINTS or budget.tolerance or has_unknown(data):
+    if (
+        len(array) != 1
+        or not 0 < len(avatar.points) <= MAX_FAST_POINTS
+        or budget.tolerance
+        or has_unknown(data)
+    ):
         return collide(data, avatar, array, margin, budget)
     verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
     other_units = data.radius_units + to_units(margin, "margin")

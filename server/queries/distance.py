@@ -128,7 +128,7 @@ def distance_fast(
     if (
         len(poses) != 1
         or not 0.0 <= reach <= MAX_FAST_REACH
-        or len(avatar.points) > MAX_FAST_POINTS
+        or not 0 < len(avatar.points) <= MAX_FAST_POINTS
         or has_unknown(data)
     ):
         return distance(data, avatar, poses, reach, budget)

@@ -12,7 +12,8 @@ exactly (sweep) or collects one item at a time (contacts), holds all voxels of a
 fit. One item whose voxels are all resident does without (`search_resident` in collide.py).
 
 A query is a generator: between two slices it yields, holding nothing. Whoever runs it decides what
-happens there; `run` goes on at once. A level of detail is in memory, so `settle` is one slice.
+happens there; `run` goes on at once. `settle` runs through, although it may load voxels of the level
+of detail.
 
 A voxel that cannot be read, that comes too late, or that the budget does not wait for is MISSING: the
 search bounds it by its box. Loads that came too late are owed (residency).

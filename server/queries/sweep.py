@@ -167,7 +167,9 @@ def sweep_slices(
     proved[which] = np.minimum(proved[which], progress.at[which])
     if len(avatar.points):
         until, unknown = np.minimum(progress.upper, 1.0), np.empty(k)
-        find_unknown_regions(*motions, data.arrays, data.tree, until, make_plan_space(), outside, unknown)
+        find_unknown_regions(
+            *motions, data.arrays, data.tree, progress.upper, make_plan_space(), outside, unknown
+        )
         if data.nothing_clear:
             unknown[:] = 0.0
         met = unknown <= until

@@ -277,9 +277,10 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
                 # Here and not in the descent: a loop that changes a tuple of arrays counts
                 # their references in every iteration, which took a third of the time.
                 state = ContactState(
-                    grow_cells(state.cells, state.sizes[CELLS]), state.heap, state.sizes, state.stack, state.pairs,
-                    state.clusters,
+                    grow_cells(state.cells, state.sizes[CELLS], scene.stop), state.heap, state.sizes,
+                    state.stack, state.pairs, state.clusters,
                 )  # fmt: skip
+                continue
             _gather_voxel(avatar, poses[i], i, scene, voxel, options, state, scratch, results)
             if state.sizes[DEPTH] == 0:
                 cursor[i] += 1

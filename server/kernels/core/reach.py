@@ -338,8 +338,8 @@ def check_poses(poses, node_radius, radius, other_units, scene, units):
     Writes units (k,) int64, the reach of each pose in exact units.
     node_radius: (a,) of the avatar's nodes, root first, may be empty.  radius: of its points [m].
     other_units: the scan's radius plus the margin, exact units.  scene: SceneArrays.
-    Returns (GOOD, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
-    set, it also returns (GOOD, 0, 0.0), with the output incomplete: the caller must then check the
+    Returns (VALID, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
+    set, it also returns (VALID, 0, 0.0), with the output incomplete: the caller must then check the
     stop flag.
     """
     reach = np.rint(radius * UNITS_PER_METRE) + float(other_units)

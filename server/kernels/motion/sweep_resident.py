@@ -189,13 +189,13 @@ def sweep_resident(
             return _NOT_ANSWERED
         proved = progress.lower[0]
     upper, until, outside, unknown_from = progress.upper[0], one.until, one.outside, one.unknown_from
-    until[0] = min(upper, 1.0)
+    until[0] = upper
     find_unknown_regions(
         box, first, last, avatar, units, from_zero, tree, until, scratch.space, outside, unknown_from
     )
     if unknown_everywhere:
         proved = 0.0
-    elif unknown_from[0] <= until[0]:
+    elif unknown_from[0] <= min(upper, 1.0):
         proved = min(proved, unknown_from[0])
     result.lower, result.upper, result.speed, result.outside = proved, upper, progress.speed[0], outside[0]
     verdict = _CLEAR if proved >= 1.0 else _UNKNOWN

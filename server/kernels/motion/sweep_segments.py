@@ -178,29 +178,29 @@ def plan_segments(box, first, last, avatar, units, scene, tree, which, progress,
 
 @nb.njit(nogil=True, cache=True)
 def find_unknown_regions(box, first, last, avatar, units, scene, tree, until, space, outside, unknown_from):
-    """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
+    """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, min(until, 1)].
 
     Writes outside (k,) bool, whether the reach leaves the scene's bounds, and unknown_from (k,)
     float64, the fraction at which it first meets the box of a scan that was left out;
     inf if it never does.
     The reach is the cube around the avatar's root sphere, as in `collide`, along chords; neither
     result depends on voxels. Once the scene's stop flag is set, motions are unknown from their
-    beginning; `outside` is then examined only where a contact was found after a short way: such a
-    contact may be exact, whatever is unknown. space: scratch.
+    beginning; `outside` is then examined only where a contact was found, which may be exact, whatever is
+    unknown. until: (k,), inf where no contact was found.  space: scratch.
     """
     begin, end = space.begin, space.end
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)
         outside[i], unknown_from[i] = False, INFINITE
-        size = avatar_size(box, units[i])
-        parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1
-        parts = 1 if motion.bend == 0.0 else parts
         if stopped(scene.stop):
             unknown_from[i] = 0.0
-            if until[i] >= 1.0 or parts > 2:
+            if until[i] == INFINITE:
                 continue
+        size, most = avatar_size(box, units[i]), min(until[i], 1.0)
+        parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * most))) + 1
+        parts = 1 if motion.bend == 0.0 else parts
         for part in range(parts):
-            t0, t1 = until[i] * part / parts, until[i] * (part + 1) / parts
+            t0, t1 = most * part / parts, most * (part + 1) / parts
             span = _reach_of_part(motion, t0, t1, avatar, units[i], scene, space)
             for r in range(3):
                 outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]

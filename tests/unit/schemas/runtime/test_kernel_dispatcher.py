@@ -1,8 +1,10 @@
 """Test the two ways to call a kernel: from Python, and from another kernel."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from solidcloud.schemas.kernels.morton import morton_code, morton_encode
@@ -65,15 +67,39 @@ def test_what_calls_is_linked_before_what_it_calls() -> None:
     assert eighth(4.0) == 0.5
 
 
-@njit()
-def middle(values):  # type: ignore[no-untyped-def]
-    """Return the median."""
-    return np.median(values)
+OWN_CODE = """
+import gc, sys
+import numba, numpy as np
+from numba.extending import register_jitable
+gc.set_threshold(0)
+from solidcloud.schemas.kernels.morton import morton_encode
+assert morton_encode(np.ones((1, 3), np.uint64)) == 7
+assert gc.get_threshold()[0] == 0
+
+@numba.njit(parallel=True)
+def total(a, b):
+    return (a + b).sum()
+
+@register_jitable(cache=True)
+def halved(x):
+    return x / 2
+
+@numba.njit(cache=True)
+def apply(f, x):
+    return halved(f(x))
+
+@numba.njit(cache=True)
+def of_sine(x):
+    return apply(np.sin, x)
+
+assert total(np.ones(3), np.ones(3)) == 6.0
+assert of_sine(0.0) == 0.0
+"""
 
 
-def test_functions_that_numba_compiles_share_its_library_with_kernels() -> None:
-    """The library's functions have no machine code of their own, whichever calls them first."""
-    values = np.array([3.0, 1.0, 2.0])
-    plain = numba.njit(lambda array: (np.median(array), np.sort(array)[0]))
-    assert middle(values) == 2.0
-    assert plain(values) == (2.0, 1.0)
+def test_code_that_a_user_compiles_in_the_same_process_works(tmp_path: Path) -> None:
+    (tmp_path / "own_code.py").write_text(OWN_CODE)
+    own = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    assert (
+        subprocess.run([sys.executable, "-P", tmp_path / "own_code.py"], env=own, check=False).returncode == 0
+    )

@@ -59,6 +59,11 @@ def test_motions_and_poses_are_answered_to_the_last_bit(
         for i in range(COUNT):
             one = collide_module.collide_fast(data, avatar, first[i])
             assert (one.verdict[0], one.node_visits[0]) == (verdicts.verdict[i], verdicts.node_visits[i])
+        nothing, away = make_avatar(np.empty((0, 3)), 0.02), first[0].copy()
+        away[:3, 3] += 1e5
+        assert collide_module.collide_fast(data, avatar, away).outside.tolist() == [True]
+        left = collide_module.collide_fast(data, nothing, first[0]).outside.tolist()
+        assert left == collide(data, nothing, first[:1]).outside.tolist()
         region = np.array([[[-(10**6)] * 3, [10**6] * 3]])
         tree = data.tree._replace(unknown=region.astype(np.float64))
         for unseen in (data._replace(unknown_everywhere=True), data._replace(tree=tree)):

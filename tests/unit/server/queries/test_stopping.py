@@ -97,6 +97,15 @@ def test_a_stop_after_a_contact_leaves_its_row_as_it_is(
     begin[0, 0, 3] -= 0.001 + data.radius_units / UNITS_PER_METRE + gap if gap else 0.0
     known = sweep(data, ball, begin, end, tolerance=0.02)
     assert known.outside.tolist() == known.exact.tolist() == [True]
+    stop_at_the_end(stop, monkeypatch)
+    found = sweep(with_stop(data, stop), ball, begin, end, tolerance=0.02, budget=effort_of(stop))
+    assert found.verdict.tolist() == known.verdict.tolist() == [Verdict.CONTACT]
+    assert found.lower.tolist() == [0.0] and found.upper.tolist() == known.upper.tolist()
+    assert found.outside.tolist() == found.exact.tolist() == [True]
+
+
+def stop_at_the_end(stop: StopFlag, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Set the flag when a sweep has found its contacts."""
     find = sweep_module.find_unknown_regions
 
     def find_later(*arguments: Any) -> None:
@@ -104,9 +113,23 @@ def test_a_stop_after_a_contact_leaves_its_row_as_it_is(
         find(*arguments)
 
     monkeypatch.setattr(sweep_module, "find_unknown_regions", find_later)
-    found = sweep(with_stop(data, stop), ball, begin, end, tolerance=0.02, budget=effort_of(stop))
+
+
+@pytest.mark.interpreted
+def test_a_stop_after_a_contact_at_the_end_leaves_its_row_as_it_is(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = np.array([[0.25, 0.0, 0.0], [0.5, 0.25, 0.25], [0.75, 0.5, 0.0]])
+    case = contact_cases.open_case(tmp_path, points, rng, scan_count=1, resolution=2.0**-10, radius=2.0**-6)
+    ball, stop, begin, end = make_avatar([[0.0, 0, 0]], 2.0**-6), StopFlag(), np.eye(4)[None], np.eye(4)[None]
+    end[0, :3, 3] = case.points[case.points[:, 0].argmin()]
+    end[0, 0, 3] -= case.data.radius_units / UNITS_PER_METRE + 2.0**-6
+    begin[0, :3, 3] = end[0, :3, 3] - [2.0**-8, 0.0, 0.0]
+    known = sweep(case.data, ball, begin, end, tolerance=0.02)
+    assert known.outside.tolist() == known.exact.tolist() == [True]
+    stop_at_the_end(stop, monkeypatch)
+    found = sweep(with_stop(case.data, stop), ball, begin, end, tolerance=0.02, budget=effort_of(stop))
     assert found.verdict.tolist() == known.verdict.tolist() == [Verdict.CONTACT]
-    assert found.lower.tolist() == [0.0] and found.upper.tolist() == known.upper.tolist()
     assert found.outside.tolist() == found.exact.tolist() == [True]
 
 

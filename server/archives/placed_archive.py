@@ -172,6 +172,7 @@ class ArchiveGeneration:
         self.prefetcher.stop()
         del self.data, self.radius_model, self.prefetcher, self.kept
         self._close_level()
+        self.level = None  # a reload keeps this generation until the next
         self.store.close()
         self.ended.set()
 

@@ -656,8 +656,9 @@ class VoxelCache:
     def counters(self) -> Counters:
         """Return the statistics of the cache."""
         with self._lock:
-            counts = {name: getattr(self.stats, name, 0) for name in Counters.__struct_fields__}
-            return Counters(**counts | {"moved_bytes": self._allocator.moved_bytes})
+            names = [name for name in Counters.__struct_fields__ if name != "moved_bytes"]
+            counts = {name: getattr(self.stats, name) for name in names}
+            return Counters(**counts, moved_bytes=self._allocator.moved_bytes)
 
     def load_times(self) -> list[float]:
         """Return the durations of the last loads [s], unordered."""

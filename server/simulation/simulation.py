@@ -116,7 +116,7 @@ class Simulation:
         self._present: dict[User, Body] = {}
         self._bodies: Bodies | None = pipeline.bodies
         self._recorder: FrameLog | None = None
-        self._frames = 0
+        self._frames, self._spent = 0, 0.0
         self._frame = threading.Lock()  # held for a frame; bodies change only while it is held
 
     @property
@@ -190,16 +190,17 @@ class Simulation:
         A user's first command places its body at the scene's spawn, or without one at the commanded
         pose. The outcome of a refused command is its error; the others are simulated.
         now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
-        first, but none with a turn: a frame that compiles or loads for longer made it wait. None: no
-        user is removed.
+        first; the time that frames take does not count, because commands wait for a frame that compiles
+        or loads. None: no user is removed.
         stop: ends the frame early: users not yet simulated stay, with the outcome ExpiredError.
         logged: of each turn, for a replay. A result with a recorded body is taken without a
         simulation, and a turn that was stopped is stopped again. All others wait for voxels.
         """
         with self._frame:
+            begun = time.monotonic()
             if now is not None:
-                silent = {u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS}
-                self._remove(list(silent.difference(turn.user for turn in turns)))
+                now -= self._spent
+                self._remove([u for u, body in self._present.items() if now - body.heard > SILENT_SECONDS])
             self._frames += 1
             outcomes = []
             for number, turn in enumerate(turns):
@@ -222,6 +223,7 @@ class Simulation:
                     self._recorder.turn(turn, state, body, self._bodies, lacked=lacked)
             if self._recorder is not None:
                 self._recorder.write(self._frames)
+            self._spent += time.monotonic() - begun
             return outcomes
 
     def _simulate_turn(

@@ -130,6 +130,7 @@ def test_a_path_that_nobody_wants_any_more_holds_nothing(place: Path, begun: boo
         del path
         assert before.ended.wait(20.0), "parts that were being computed have ended too"
         assert not before.take()
+        assert before.level is None, "nor the memory of its level"
 
 
 def truncate(place: Path) -> None:

@@ -15,6 +15,7 @@ from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
 from solidcloud.schemas.wire.key_expressions import User, public_id
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.server.scene_interface import EVERYBODY, FrameCommand
+from solidcloud.server.simulation import simulation as simulation_module
 from solidcloud.server.simulation.simulation import SILENT_SECONDS, Simulation
 
 pytestmark = pytest.mark.interpreted
@@ -152,11 +153,15 @@ def test_who_wishes_nothing_for_long_has_left(floor):
     assert floor.users == [BO], "half a second short of it"
 
 
-def test_a_frame_that_takes_long_removes_no_user_whose_command_waited(floor):
+def test_a_frame_that_takes_long_removes_no_user_whose_command_waited(floor, monkeypatch):
+    clock = iter([0.0, 1.0 + SILENT_SECONDS, 100.0, 100.0])  # the first frame compiles
+    monkeypatch.setattr(simulation_module.time, "monotonic", lambda: next(clock, 100.0))
     floor.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))], now=100.0)
     turns = [FrameCommand(AL, wish(2, velocity=(0.0, 0.0, 0.0)))]
-    (moved,) = floor.step(turns, now=101.0 + SILENT_SECONDS)
+    (moved,) = floor.step(turns, now=102.0 + SILENT_SECONDS)
     assert np.array_equal(moved.state.pose, pose_at(0.5)), "goes on where it was, not at the spawn"
+    assert floor.users == [AL, BO]
+    floor.step([], now=101.5 + 2 * SILENT_SECONDS)
     assert floor.users == [AL]
 
 

@@ -91,7 +91,7 @@ def _violations(report: dict[str, Any], run: ChaosRun, limits: Limits) -> list[s
     last = [quiet for quiet in server_runs.quiet if quiet.life == server_runs.number]
     if growth is not None and growth.high > GROWTH:
         found.append(f"memory grows by {_in_words(growth)}: under {GROWTH:g} expected, with the interval")
-    elif growth is None and last and last[-1].age > 2 * SETTLED_SECONDS:
+    elif growth is None and last and last[-1].age > SETTLED_SECONDS + 100:
         found.append(f"memory: {_in_words(growth)}")
     if last and last[-1].clients > run.ids:
         found.append(f"avatars of {last[-1].clients} clients at the end, of {run.ids} expected")

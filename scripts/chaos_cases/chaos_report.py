@@ -94,7 +94,7 @@ def _violations(report: dict[str, Any], run: ChaosRun, limits: Limits) -> list[s
     if growth is not None and growth.high > GROWTH:
         found.append(f"memory grows by {_in_words(growth)}: under {GROWTH:g} expected, with the interval")
     elif growth is None and (
-        run.done["no quiet point"] > len(last) or (last and last[-1].age > 2 * SETTLED_SECONDS)
+        run.done["no quiet point"] > len(last) or (last and last[-1].age > SETTLED_SECONDS + 100)
     ):
         found.append(f"memory: {_in_words(growth)}")
     if last and last[-1].clients > run.ids:
